@@ -1,0 +1,156 @@
+"""The data that flows through the filter: `Frame`, `History`, `Output`, `Params`, `Config`.
+
+Conventions, stated here once:
+
+- Arrays are `[H, W, C]`, a sequence has a leading `T`, a frame has S >= 1 *signals*. Row 0 is at the top, x points right,
+  y down; the centre of pixel (x, y) is at (x + 0.5, y + 0.5).
+- Radiance is scene-linear and unclamped. Luminance is Rec. 709: 0.2126 R + 0.7152 G + 0.0722 B.
+- A *signal* is reflected radiance with an albedo of its own. SVGF's direct and indirect light share one albedo (S = 2); a
+  plain beauty pass is S = 1. beauty = sum of radiance over the signals + emission.
+- `prev_` marks the previous frame; no prefix means this one.
+
+| channel       | shape                  | unit and range                                                                    |
+|---------------|------------------------|-----------------------------------------------------------------------------------|
+| `radiance`    | `[S, H, W, 3]`         | scene-linear, >= 0                                                                |
+| `albedo`      | `[S or 1, H, W, 3]`    | reflectance, >= 0 (1 where the radiance is already demodulated)                   |
+| `emission`    | `[H, W, 3]`            | scene-linear; emitters and background, never filtered                             |
+| `normal`      | `[H, W, 3]`            | unit length, world space                                                          |
+| `depth`       | `[H, W]`               | linear view-space z, > 0 in front of the camera                                   |
+| `prev_depth`  | `[H, W]`               | the depth that this surface point had in the previous frame's camera, else `depth`|
+| `motion`      | `[H, W, 2]`            | pixels: previous position = this position + motion (x right, y down)              |
+| `object_id`   | `[H, W]` int32         | any number per object; -1 = no surface (background)                               |
+"""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from jax import Array
+else:
+    Array = Any  # importing this module must not import jax: the command line answers errors without it
+
+
+class SvgfError(Exception):
+    """An error its reader can act on: the message says what was got, what was wanted and what to try."""
+
+
+class Frame(NamedTuple):
+    """One frame as the renderer wrote it. Shapes and units: the table at the top of this module."""
+
+    radiance: Array
+    albedo: Array
+    emission: Array
+    normal: Array
+    depth: Array
+    prev_depth: Array
+    motion: Array
+    object_id: Array
+
+
+class History(NamedTuple):
+    """What the next frame needs of the past.
+
+    Attributes:
+        illumination: `[S, H, W, 3]`, accumulated and once-filtered demodulated radiance.
+        moments: `[S, H, W, 2]`, accumulated first and second moment of the illumination's luminance.
+        history_length: `[H, W]`, frames accumulated, a real number in [0, max_history]; 0 = no history.
+        depth, normal, object_id: the sanitised guides of the frame that this history ends with.
+    """
+
+    illumination: Array
+    moments: Array
+    history_length: Array
+    depth: Array
+    normal: Array
+    object_id: Array
+
+
+class Rejected(NamedTuple):
+    """How many pixels of a frame had to be repaired before filtering (int32 scalars).
+
+    Attributes:
+        radiance: pixels with a non-finite radiance component (set to 0), over all signals.
+        negative: pixels with a negative radiance component (set to 0), over all signals.
+        emission: pixels with a non-finite emission component (set to 0).
+        surface: surface pixels dropped for a non-finite normal, depth or albedo.
+        motion: surface pixels without history for a non-finite motion or prev_depth.
+    """
+
+    radiance: Array
+    negative: Array
+    emission: Array
+    surface: Array
+    motion: Array
+
+
+class Output(NamedTuple):
+    """What a frame gives to the world.
+
+    Attributes:
+        image: `[H, W, 3]`, the filtered beauty, scene-linear.
+        illumination: `[S, H, W, 3]`, the filtered demodulated signals.
+        variance: `[S, H, W]`, luminance variance before the a-trous filter.
+        variance_filtered: `[S, H, W]`, the same after its last level.
+        history_length: `[H, W]`, frames accumulated, this one included; 0 where there is no surface.
+        valid: `[H, W]` bool, whether reprojection found history.
+        rejected: counts of repaired pixels.
+    """
+
+    image: Array
+    illumination: Array
+    variance: Array
+    variance_filtered: Array
+    history_length: Array
+    valid: Array
+    rejected: Rejected
+
+
+class Params(NamedTuple):
+    """The filter's numbers. Traced and differentiable; each a scalar or one value per a-trous level.
+
+    The defaults are the preset `paper`. Where a stage other than the a-trous filter reads a per-level value, it takes entry 0.
+    Falcor's SVGFPass has other names for some: Alpha, MomentsAlpha, PhiNormal (sigma_normal), PhiColor (sigma_luminance).
+
+    Attributes:
+        alpha: least weight of the new frame in the accumulated illumination, in (0, 1].
+        alpha_moments: the same for the moments.
+        sigma_depth: depth edge-stopping, in units of the depth that the local slope predicts, > 0.
+        sigma_normal: normal edge-stopping, exponent of the cosine, >= 0.
+        sigma_luminance: luminance edge-stopping, in standard deviations, > 0.
+        short_history_boost: factor on the spatial variance estimate at history length 1, >= 1.
+        max_history: cap of the history length, in frames, >= 1.
+        albedo_floor: smallest albedo divided by, > 0.
+        depth_epsilon: depth tolerance relative to depth, > 0.
+        luminance_epsilon: luminance tolerance, > 0.
+        reproject_depth: largest relative depth difference of a consistent previous pixel, > 0.
+        reproject_normal: smallest cosine between the normals of consistent pixels, in [-1, 1).
+        kernel_near: a-trous tap at distance 1 relative to the centre tap (B3 spline: 2/3), > 0.
+        kernel_far: a-trous tap at distance 2 relative to the centre tap (B3 spline: 1/6), > 0.
+    """
+
+    alpha: Any = 0.2
+    alpha_moments: Any = 0.2
+    sigma_depth: Any = 1.0
+    sigma_normal: Any = 128.0
+    sigma_luminance: Any = 4.0
+    short_history_boost: Any = 1.0
+    max_history: Any = 32.0
+    albedo_floor: Any = 1e-3
+    depth_epsilon: Any = 1e-3
+    luminance_epsilon: Any = 1e-6
+    reproject_depth: Any = 0.1
+    reproject_normal: Any = 0.9
+    kernel_near: Any = 2 / 3
+    kernel_far: Any = 1 / 6
+
+
+class Config(NamedTuple):
+    """The filter's static choices: hashable, part of what jit compiles for.
+
+    Attributes:
+        levels: number of a-trous levels, >= 0; level i has step size 2**i.
+        feedback_level: the level whose output becomes the history illumination; -1 = the unfiltered accumulation.
+            Beyond the last level it is the last.
+    """
+
+    levels: int = 5
+    feedback_level: int = 0

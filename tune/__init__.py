@@ -1,0 +1,1 @@
+"""Fit the filter's weights to a renderer's own noise."""
