@@ -1,0 +1,107 @@
+"""Pictures to look at: tone-mapped 8-bit images, labelled side by side, as PNG or MP4. No JAX."""
+
+import importlib
+import os
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from svgf_jax.types import SvgfError
+
+WHITE = 4.0  # radiance that becomes full white (at exposure 1)
+
+
+def tonemap(image: np.ndarray, *, exposure: float = 1.0) -> np.ndarray:
+    """Scene-linear `[H, W, 3]` to 8-bit sRGB `[H, W, 3]` uint8.
+
+    Extended Reinhard (2002, eq. 4) on each channel, `x (1 + x / WHITE^2) / (1 + x)`, then the sRGB curve. `exposure` is
+    a factor on the radiance, > 0. Negative and nan count as 0; everything from WHITE on is 255.
+    """
+    if not (np.isfinite(exposure) and exposure > 0):
+        raise SvgfError(f"Got the exposure {exposure}; wanted a finite number above 0, for example 1 (no change) or 2.")
+    linear = np.clip(np.nan_to_num(np.asarray(image, np.float32)), 0, WHITE / exposure) * exposure
+    curve = linear * (1 + linear / WHITE**2) / (1 + linear)
+    srgb = np.where(curve <= 0.0031308, 12.92 * curve, 1.055 * np.maximum(curve, 0.0031308) ** (1 / 2.4) - 0.055)
+    return (srgb * 255 + 0.5).astype(np.uint8)
+
+
+def side_by_side(panels: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
+    """8-bit `[H, W, 3]` pictures of one height in a row, each with its label on a strip above: `[H', W', 3]` uint8."""
+    if len({picture.shape[0] for _, picture in panels}) != 1:
+        shapes = [picture.shape for _, picture in panels]
+        raise SvgfError(f"Cannot set pictures of shapes {shapes} side by side: wanted at least one, all of one height.")
+    size = max(11, panels[0][1].shape[0] // 16)
+    strip, gap = round(1.7 * size), 2
+    width = sum(picture.shape[1] for _, picture in panels) + gap * (len(panels) - 1)
+    canvas = Image.new("RGB", (width, panels[0][1].shape[0] + strip), (24, 24, 24))
+    draw, left = ImageDraw.Draw(canvas), 0
+    for label, picture in panels:
+        canvas.paste(Image.fromarray(picture), (left, strip))
+        middle = (left + picture.shape[1] / 2, strip / 2)
+        draw.text(middle, label, fill=(235, 235, 235), font=ImageFont.load_default(size), anchor="mm")
+        left += picture.shape[1] + gap
+    return np.asarray(canvas)
+
+
+def write_png(path: str | Path, picture: np.ndarray) -> None:
+    """Write `[H, W, 3]` uint8 as PNG, under a temporary name and then renamed. `SvgfError` where that fails."""
+    _write_atomically(path, lambda temporary: Image.fromarray(picture).save(temporary, format="PNG"))
+
+
+def write_video(path: str | Path, pictures: Iterable[np.ndarray], *, fps: float = 24.0) -> None:
+    """Write `[H, W, 3]` uint8 pictures of one size as an MP4 (H.264), under a temporary name and then renamed.
+
+    Holds one picture at a time. An odd width or height, which H.264 cannot store, is filled up by repeating the last
+    row or column. Needs the extra `video` (PyAV); `SvgfError` without it, and where writing fails.
+    """
+    av = _av()
+
+    def encode(temporary: str) -> None:
+        with av.open(temporary, "w", format="mp4") as container:
+            stream = None
+            for picture in pictures:
+                height, width = picture.shape[:2]
+                even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+                if stream is None:
+                    stream = container.add_stream("libx264", rate=round(fps), options={"crf": "16"})
+                    stream.height, stream.width, stream.pix_fmt = *even.shape[:2], "yuv420p"
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")))
+            if stream is None:
+                raise SvgfError(f"There is no picture to put into the video {path}: wanted at least one frame.")
+            container.mux(stream.encode())
+
+    _write_atomically(path, encode, av.FFmpegError)
+
+
+def require_video() -> None:
+    """Raise `SvgfError` where the extra `video` is not installed, so that a long job finds out before it starts."""
+    _av()
+
+
+def _av():
+    """The module `av`: the only place that knows it."""
+    try:
+        return importlib.import_module("av")
+    except ImportError as error:
+        raise SvgfError(
+            "A video was asked for, but the package av (PyAV) is not installed. "
+            "Try `pip install 'svgf-jax[video]'`, or leave the video out."
+        ) from error
+
+
+def _write_atomically(path: str | Path, write: Callable[[str], None], *failures: type[Exception]) -> None:
+    """Call `write(temporary name in the same folder)`, make it durable, rename it to `path`."""
+    temporary = f"{path}.{os.getpid()}.tmp"
+    try:
+        write(temporary)
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except (OSError, *failures) as error:
+        raise SvgfError(
+            f"Could not write {path}: {error}. Check that the folder exists, is writable and is not full."
+        ) from error
+    finally:
+        Path(temporary).unlink(missing_ok=True)
