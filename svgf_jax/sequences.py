@@ -1,0 +1,198 @@
+"""Which files are the frames: folders, patterns and ranges as people write them, and what is missing.
+
+A pattern names the frame number's place: `frame_####.exr` (one digit for each #, also `@` or `?`), `frame_%04d.exr`,
+`frame_$F4.exr`; `#`, `%d` or `$F` is a number without padding. A range is `1-100`, `1-100x2` (every second) or
+`1,3,5-9`. Frames are always taken in ascending order.
+"""
+
+import difflib
+import os
+import re
+from collections.abc import Iterable
+from typing import Literal, NamedTuple, get_args
+
+from fileseq.constants import PAD_STYLE_HASH1
+from fileseq.exceptions import FileSeqException
+from fileseq.filesequence import FileSequence
+from fileseq.frameset import FrameSet
+
+from svgf_jax.exr_layout import PathName
+from svgf_jax.types import SvgfError
+
+Missing = Literal["error", "hold", "reset"]
+
+_PLACE = re.compile(r"[#@?]+|%(?:0?\d+)?d|\$F\d*")
+
+
+class Sequence(NamedTuple):
+    """The frames of a sequence, found on the disk before any is read.
+
+    Attributes:
+        files: frame number and path of each frame, ascending; the path is None where the file is missing.
+        name: the pattern, for people: `shot/frame_####.exr`, or the path of a single file.
+        padding: least number of digits of the frame number; 0 for a file without a number.
+        missing: what a missing frame means: "hold" keeps the history for the next frame, "reset" starts anew after it.
+    """
+
+    files: tuple[tuple[int, str | None], ...]
+    name: str
+    padding: int
+    missing: Missing
+
+
+def find_sequence(
+    pattern: PathName, *, frames: str | None = None, missing: Missing = "error", prefer: tuple[str, ...] = ("frame",)
+) -> Sequence:
+    """The sequence that a pattern, a folder or a single file stands for.
+
+    In a folder that holds several sequences the first that is called as in `prefer` is taken (`frame_0001.exr` is
+    called frame). Without `frames` every frame between the first and the last on the disk is wanted. Raises
+    SvgfError: nothing there, an unclear folder, a range that cannot be read, missing frames under "error".
+    """
+    if missing not in get_args(Missing):
+        raise SvgfError(f"missing={missing!r} is not known; choose one of {', '.join(get_args(Missing))}.")
+    text = os.fspath(pattern)
+    wanted = None if frames is None else parse_range(frames)
+    if os.path.isdir(text):
+        text = _pick(text, prefer)
+    if os.path.isfile(text):
+        number = re.search(r"(\d+)(?!.*\d)", os.path.basename(text))
+        if wanted is None or number is None:
+            return _single(text, number, wanted, missing)
+        start = len(text) - len(os.path.basename(text))
+        text = text[: start + number.start()] + "#" * len(number[0]) + text[start + number.end() :]
+    found, padding = _match(text)
+    if not found:
+        raise SvgfError(f"{text}: no such {'frames' if padding else 'file or folder'}. {_near(text)}")
+    if wanted is None:
+        wanted = list(range(min(found), max(found) + 1))
+    gaps = [number for number in wanted if number not in found]
+    if gaps and (missing == "error" or len(gaps) == len(wanted)):
+        there = format_range(found)
+        raise SvgfError(
+            f"{text}: {len(gaps)} of {len(wanted)} frames are missing: {format_range(gaps)}; on the disk are {there}. "
+            f"Render them, or take a range that is there (--frames {there})"
+            + (", or go on without them (--missing hold|reset)." if len(gaps) < len(wanted) else ".")
+        )
+    return Sequence(tuple((number, found.get(number)) for number in wanted), text, padding, missing)
+
+
+def companion(sequence: Sequence, pattern: PathName, *, partial: bool = False) -> Sequence:
+    """The files of another pattern (or one file for all frames) with the frame numbers of `sequence`.
+
+    A relative pattern may also be meant beside the sequence's own files. Raises SvgfError where a frame that the
+    sequence has is missing here, unless `partial`.
+    """
+    text = os.fspath(pattern)
+    beside = os.path.join(os.path.dirname(sequence.name), text)
+    text = next((place for place in (text, beside) if os.path.exists(place) or _match(place)[0]), text)
+    if os.path.isfile(text):
+        return sequence._replace(files=tuple((number, text) for number, _ in sequence.files), name=text, padding=0)
+    other = find_sequence(text, missing="hold")
+    paths = dict(other.files)
+    files = tuple((number, paths.get(number)) for number, _ in sequence.files)
+    gaps = [number for (number, path), (_, own) in zip(files, sequence.files, strict=True) if own and not path]
+    if gaps and not partial:
+        there = format_range(number for number, path in other.files if path)
+        raise SvgfError(
+            f"{other.name}: frames {format_range(gaps)} of {sequence.name} are missing here; on the disk are {there}. "
+            f"Render them, or take a range that both have (--frames)."
+        )
+    return sequence._replace(files=files, name=other.name, padding=other.padding)
+
+
+def parse_range(text: str) -> list[int]:
+    """Frame numbers of `1-100`, `1-100x2`, `1,3,5-9`, ascending and each once. Raises SvgfError."""
+    try:
+        numbers = sorted({int(str(number)) for number in FrameSet(text)})
+    except (FileSeqException, ValueError, TypeError):
+        numbers = []
+    if not numbers:
+        raise SvgfError(f"frame range {text!r} cannot be read; wanted something like 1-100, 1-100x2 or 1,3,5-9.")
+    return numbers
+
+
+def format_range(numbers: Iterable[int]) -> str:
+    """`1-5,7`: the shortest way to write frame numbers."""
+    return FrameSet.framesToFrameRange(numbers, sort=True)
+
+
+def _single(path: str, number: re.Match | None, wanted: list[int] | None, missing: Missing) -> Sequence:
+    if wanted is not None and len(wanted) != 1:
+        raise SvgfError(
+            f"{path}: one file without a frame number, but {len(wanted)} frames are asked for; try a pattern."
+        )
+    frame = wanted[0] if wanted else int(number[0]) if number else 0
+    return Sequence(((frame, path),), path, len(number[0]) if number else 0, missing)
+
+
+def _match(pattern: str) -> tuple[dict[int, str], int]:
+    """Path by frame number of the files that match, and the padding (0: the pattern has no place for a number)."""
+    folder, name = os.path.split(pattern)
+    places = list(_PLACE.finditer(name))
+    if len(places) > 1 or (_PLACE.search(folder) and not os.path.isdir(folder)):
+        raise SvgfError(
+            f"{pattern}: wanted one place for the frame number, in the file's name; for example frame_####.exr."
+        )
+    if not places:
+        return {}, 0
+    place = places[0]
+    padding = max(1, FileSequence.getPaddingNum(place[0].replace("?", "#"), pad_style=PAD_STYLE_HASH1))
+    form = re.compile(re.escape(name[: place.start()]) + r"(-?\d+)" + re.escape(name[place.end() :]))
+    found = {}
+    for entry in _list(folder):
+        hit = form.fullmatch(entry)
+        if hit and hit[1] == str(int(hit[1])).zfill(padding):
+            found[int(hit[1])] = os.path.join(folder, entry)
+    return found, padding
+
+
+def _pick(folder: str, prefer: tuple[str, ...]) -> str:
+    """The one EXR sequence (or file) of a folder that is meant."""
+    names = _patterns(folder)
+    called = {re.split(r"[#]", name)[0].rstrip("._- ").lower(): name for name in names if "#" in name}
+    for name in prefer:
+        if name in called:
+            return os.path.join(folder, called[name])
+    choice = list(called.values()) if len(called) == 1 else names
+    if len(choice) == 1:
+        return os.path.join(folder, choice[0])
+    if not choice:
+        raise SvgfError(f"{folder}: no EXR files in this folder. {_near(os.path.join(folder, 'x'))}")
+    raise SvgfError(
+        f"{folder}: several sequences are here: {', '.join(names)}. Say which: {os.path.join(folder, names[0])}"
+    )
+
+
+def _patterns(folder: str) -> list[str]:
+    """The EXR sequences of a folder as patterns, single files as themselves."""
+    files = [name for name in _list(folder) if name.lower().endswith(".exr")]
+    found = FileSequence.findSequencesInList(files, pad_style=PAD_STYLE_HASH1)
+    return sorted(f"{item.basename()}{item.padding()}{item.extension()}" for item in found)
+
+
+def _near(pattern: str) -> str:
+    """What is there instead, for an error message."""
+    folder, name = os.path.split(pattern)
+    if not os.path.isdir(folder or "."):
+        while folder and not os.path.isdir(os.path.dirname(folder) or "."):
+            folder = os.path.dirname(folder)
+        parent, missing = os.path.split(folder)
+        close = difflib.get_close_matches(missing, _list(parent), n=3, cutoff=0.5)
+        return f"There is no folder {folder}" + (f"; did you mean {' or '.join(close)}?" if close else ".")
+    names = _patterns(folder)
+    if not names:
+        others = [entry for entry in _list(folder) if not entry.startswith(".")][:5]
+        return f"The folder {folder or '.'} holds " + (
+            f"no EXR files, but {', '.join(others)}." if others else "no files."
+        )
+    close = difflib.get_close_matches(name, names, n=5, cutoff=0.0)
+    return f"In {folder or '.'} there is {', '.join(close)}" + (" ..." if len(names) > len(close) else ".")
+
+
+def _list(folder: str) -> list[str]:
+    """The names in a folder, hidden ones (unfinished output) left out; none if it cannot be read."""
+    try:
+        return sorted(name for name in os.listdir(folder or ".") if not name.startswith("."))
+    except OSError:
+        return []
