@@ -1,7 +1,7 @@
 """SVGF in plain Python loops and float64: the yardstick that the library is held against.
 
 Written from the specification alone: it shares no line with the library and never imports it. A stage is one loop over
-pixels with one loop over taps inside, in the order of the specification, so that it can be checked against the paper by eye.
+pixels with one loop over taps inside, in the order of the specification, to be checked against the paper by eye.
 
 Data are plain dicts of NumPy arrays:
 
