@@ -1,0 +1,219 @@
+"""Cameras and moving objects of a sequence: where each surface point was one frame ago, exactly.
+
+`cameras.json` holds, for each frame, row-major 4x4 matrices for column vectors:
+
+    {"width": 480, "height": 270,
+     "per_frame": [{"frame": 0,
+                    "world_to_camera": [[...] * 4] * 4,     x right, y down, z forward
+                    "camera_to_screen": ...,                pixel = (X / W, Y / W), y down, centres at + 0.5
+                    "object_motion": {"7": ...}}, ...]}     by object id, world at this frame -> at the one before
+
+Also understood: `world_to_screen` in place of `camera_to_screen`, and `object_to_world` by id in place of
+`object_motion`. Objects that are not listed stand still. Arithmetic is in float64.
+"""
+
+import json
+import os
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from svgf_jax.exr_layout import PathName
+from svgf_jax.types import SvgfError
+
+BEHIND = -1e4
+"""Previous pixel coordinate given to points that were behind the previous camera: far outside any image."""
+
+
+class Camera(NamedTuple):
+    """One frame's camera and objects; matrices `[4, 4]` float64, objects by id."""
+
+    world_to_camera: np.ndarray
+    camera_to_screen: np.ndarray
+    object_motion: dict[int, np.ndarray]
+    object_to_world: dict[int, np.ndarray]
+
+
+class Cameras(NamedTuple):
+    """A sequence's cameras by frame number; `size` is (width, height) of the picture, if the file says it."""
+
+    path: str
+    frames: dict[int, Camera]
+    size: tuple[int, int] | None
+
+
+def load_cameras(path: PathName) -> Cameras:
+    """Read a cameras.json. Raises SvgfError that names the file and the entry that is wrong."""
+    name = os.fspath(path)
+    try:
+        with open(name, encoding="utf-8") as file:
+            data = json.load(file)
+    except OSError as error:
+        raise SvgfError(f"{name}: cannot be read ({error.strerror or error}).") from error
+    except ValueError as error:
+        raise SvgfError(f"{name}: not valid JSON ({error}).") from error
+    entries = data.get("per_frame") if isinstance(data, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise SvgfError(f'{name}: no list "per_frame" of cameras; wanted {{"per_frame": [{{"frame": 0, ...}}, ...]}}.')
+    frames = {}
+    for at, entry in enumerate(entries):
+        number = entry.get("frame") if isinstance(entry, dict) else None
+        if not isinstance(number, int) or number in frames:
+            raise SvgfError(f'{name}: per_frame[{at}] has "frame": {number!r}; wanted a frame number, each only once.')
+        frames[number] = _camera(entry, f"{name}: frame {number}")
+    width, height = data.get("width"), data.get("height")
+    return Cameras(name, frames, (width, height) if isinstance(width, int) and isinstance(height, int) else None)
+
+
+def find_camera(cameras: Cameras, number: int) -> Camera:
+    """The camera of a frame. Raises SvgfError where the file has none."""
+    if number not in cameras.frames:
+        there = sorted(cameras.frames)
+        raise SvgfError(
+            f"{cameras.path}: no camera for frame {number}; it has frames {there[0]} to {there[-1]} ({len(there)}). "
+            "Add the frame, or go on without cameras (--cameras none)."
+        )
+    return cameras.frames[number]
+
+
+def pixel_centres(shape: tuple[int, ...], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """`[H, W, 2]` screen coordinates of the centres of `shape` pixels; `origin` is the first pixel's place (of a crop)."""
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(np.float64)
+    return np.stack([x + origin[0] + 0.5, y + origin[1] + 0.5], -1)
+
+
+def position_from_depth(camera: Camera, depth: np.ndarray, *, origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """World position `[H, W, 3]` of what is seen at view-space z `depth` `[H, W]` through each pixel's centre."""
+    return _from_camera(camera, _seen_at(camera, depth, origin), 1.0)
+
+
+def previous_position(
+    cameras: Cameras, position: np.ndarray, object_id: np.ndarray, *, number: int, previous: int
+) -> np.ndarray:
+    """World position `[H, W, 3]` that the surface points of frame `number` had at frame `previous`."""
+    moved = position.astype(np.float64)
+    for key, matrix in _object_motion(cameras, number, previous).items():
+        here = object_id == key
+        if here.any():
+            moved[here] = moved[here] @ matrix[:3, :3].T + matrix[:3, 3]
+    return moved
+
+
+def reproject(
+    cameras: Cameras,
+    depth: np.ndarray,
+    object_id: np.ndarray,
+    *,
+    number: int,
+    previous: int,
+    position: np.ndarray | None = None,
+    origin: tuple[int, int] = (0, 0),
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the points of frame `number` were at frame `previous`.
+
+    Args:
+        cameras: of both frames.
+        depth: `[H, W]` view-space z.
+        object_id: `[H, W]`, -1 = no surface: such pixels move as directions at infinity do.
+        number, previous: frame numbers.
+        position: `[H, W, 3]` world positions, if the renderer wrote them; else taken from depth and camera.
+        origin: the first pixel's place on the screen.
+
+    Returns:
+        prev_depth `[H, W]` and motion `[H, W, 2]`, float32. Points behind the previous camera get the previous pixel
+        (-1e4, -1e4); prev_depth is 0 where there is no surface.
+    """
+    camera, before = find_camera(cameras, number), find_camera(cameras, previous)
+    surface = object_id != -1
+    with np.errstate(all="ignore"):  # what is not finite in the file stays so: the filter counts it
+        if position is None:
+            position = position_from_depth(camera, np.where(surface, depth, 1.0), origin=origin)
+        point = previous_position(cameras, position, object_id, number=number, previous=previous)
+        there = point @ before.world_to_camera[:3, :3].T + before.world_to_camera[:3, 3]
+        away = _seen_at(camera, np.ones_like(depth), origin) - _seen_at(camera, np.zeros_like(depth), origin)
+        away = _from_camera(camera, away, 0.0) @ before.world_to_camera[:3, :3].T
+        there = np.where(surface[..., None], there, away)
+        column = before.camera_to_screen[:, 3] * np.where(surface, 1.0, 0.0)[..., None]
+        screen = there @ before.camera_to_screen[:, :3].T + column
+        ahead = screen[..., 3] > 0
+        pixel = np.where(ahead[..., None], screen[..., :2] / np.where(ahead, screen[..., 3], 1.0)[..., None], BEHIND)
+        motion = pixel - pixel_centres(depth.shape, origin)
+        prev_depth = np.where(surface, there[..., 2], 0.0)
+    return prev_depth.astype(np.float32), motion.astype(np.float32)
+
+
+def position_residual(camera: Camera, position: np.ndarray, *, origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """`[H, W]` pixels between the centre of each pixel and where the camera shows its `position` `[H, W, 3]`.
+
+    About 0 where cameras, positions and pixel grid belong together; meaningless where there is no surface.
+    """
+    there = position.astype(np.float64) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    screen = there @ camera.camera_to_screen[:, :3].T + camera.camera_to_screen[:, 3]
+    with np.errstate(all="ignore"):
+        apart = screen[..., :2] / screen[..., 3:] - pixel_centres(position.shape[:2], origin)
+        return np.hypot(apart[..., 0], apart[..., 1])
+
+
+def _seen_at(camera: Camera, depth: np.ndarray, origin: tuple[int, int]) -> np.ndarray:
+    """Camera-space point `[H, W, 3]` at z = depth that lands on each pixel's centre.
+
+    With rows r of camera_to_screen, X - px W = 0 and Y - py W = 0 are two linear equations in x and y.
+    """
+    rows = camera.camera_to_screen
+    centre = pixel_centres(depth.shape, origin)
+    to_x = rows[0] - centre[..., :1] * rows[3]
+    to_y = rows[1] - centre[..., 1:] * rows[3]
+    right_x = -(to_x[..., 2] * depth + to_x[..., 3])
+    right_y = -(to_y[..., 2] * depth + to_y[..., 3])
+    determinant = to_x[..., 0] * to_y[..., 1] - to_x[..., 1] * to_y[..., 0]
+    x = (right_x * to_y[..., 1] - to_x[..., 1] * right_y) / determinant
+    y = (to_x[..., 0] * right_y - right_x * to_y[..., 0]) / determinant
+    return np.stack([x, y, depth], -1)
+
+
+def _from_camera(camera: Camera, vector: np.ndarray, w: float) -> np.ndarray:
+    """Camera space to world; w = 1 for points, 0 for directions."""
+    to_world = np.linalg.inv(camera.world_to_camera)
+    return vector @ to_world[:3, :3].T + w * to_world[:3, 3]
+
+
+def _object_motion(cameras: Cameras, number: int, previous: int) -> dict[int, np.ndarray]:
+    """World -> world from one frame to another by object id, for the objects that move."""
+    here, there = find_camera(cameras, number), find_camera(cameras, previous)
+    if not here.object_motion and not there.object_motion:
+        both = here.object_to_world.keys() & there.object_to_world.keys()
+        return {key: there.object_to_world[key] @ np.linalg.inv(here.object_to_world[key]) for key in both}
+    motion: dict[int, np.ndarray] = {}
+    for step in range(number, previous, -1):  # frame by frame: object_motion reaches back by one
+        for key, matrix in find_camera(cameras, step).object_motion.items():
+            motion[key] = matrix @ motion.get(key, np.eye(4))
+    return motion
+
+
+def _camera(entry: dict[str, Any], where: str) -> Camera:
+    to_camera = _matrix(entry.get("world_to_camera"), f'{where}: "world_to_camera"')
+    if "camera_to_screen" in entry:
+        to_screen = _matrix(entry["camera_to_screen"], f'{where}: "camera_to_screen"')
+    else:
+        whole = _matrix(entry.get("world_to_screen"), f'{where}: "camera_to_screen" (or "world_to_screen")')
+        to_screen = whole @ np.linalg.inv(to_camera)
+    return Camera(to_camera, to_screen, *(_by_id(entry, key, where) for key in ("object_motion", "object_to_world")))
+
+
+def _by_id(entry: dict[str, Any], key: str, where: str) -> dict[int, np.ndarray]:
+    objects = entry.get(key) or {}
+    if not isinstance(objects, dict) or not all(name.lstrip("-").isdigit() for name in objects):
+        raise SvgfError(f'{where}: "{key}" wants matrices by object id, such as {{"7": [[1, 0, 0, 0], ...]}}.')
+    return {int(name): _matrix(value, f'{where}: "{key}" of object {name}') for name, value in objects.items()}
+
+
+def _matrix(value: Any, what: str) -> np.ndarray:
+    try:
+        matrix = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise SvgfError(f"{what} is {'missing' if value is None else 'wrong'}; wanted 4 x 4 finite numbers.")
+    if "screen" not in what and abs(np.linalg.det(matrix)) < 1e-300:
+        raise SvgfError(f"{what} cannot be inverted; wanted a camera or object transform.")
+    return matrix
