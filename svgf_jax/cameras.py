@@ -77,7 +77,7 @@ def find_camera(cameras: Cameras, number: int) -> Camera:
 
 
 def pixel_centres(shape: tuple[int, ...], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
-    """`[H, W, 2]` screen coordinates of the centres of `shape` pixels; `origin` is the first pixel's place (of a crop)."""
+    """`[H, W, 2]` screen coordinates of pixel centres; `origin` is the first pixel's place on the screen (a crop)."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(np.float64)
     return np.stack([x + origin[0] + 0.5, y + origin[1] + 0.5], -1)
 
