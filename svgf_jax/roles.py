@@ -1,0 +1,199 @@
+"""Which channel of an EXR plays which role.
+
+Native names, as they are looked for in each frame's file:
+
+| role       | channels                     | where absent                                              |
+|------------|------------------------------|-----------------------------------------------------------|
+| `direct`   | `direct.R direct.G direct.B` | one of direct, indirect, radiance must be there           |
+| `indirect` | `indirect.R ...`             |                                                           |
+| `radiance` | `R G B`, if neither is there | (the full beauty: emission, if there is any, is taken off)|
+| `emission` | `emission.R ...`             | 0: emitters are filtered like everything else             |
+| `albedo`   | `albedo.R ...`               | 1: textures are filtered together with the light          |
+| `normal`   | `normal.X normal.Y normal.Z` | one direction for all: normals stop no edges              |
+| `depth`    | `depth.Z`, or `Z`            | 1: depth stops no edges                                   |
+| `motion`   | `motion.X motion.Y`          | from the cameras; without them 0: everything stands still |
+| `id`       | `id.I`                       | one object: only depth and normals tell surfaces apart    |
+| `position` | `position.X ...`             | from depth and camera where needed                        |
+| `alpha`    | `A`, if radiance is `R G B`  | every pixel may have a surface                            |
+
+Any role can be given by hand: other channels (`channel`), another file (`file`), or both.
+"""
+
+import difflib
+from collections.abc import Collection, Iterable, Mapping
+from typing import NamedTuple
+
+from svgf_jax.types import SvgfError
+
+WIDTH = {
+    "direct": 3,
+    "indirect": 3,
+    "radiance": 3,
+    "emission": 3,
+    "albedo": 3,
+    "normal": 3,
+    "depth": 1,
+    "motion": 2,
+    "id": 1,
+    "position": 3,
+    "alpha": 1,
+}
+"""Number of channels of each role."""
+
+ALIASES = {"color": "radiance", "colour": "radiance", "beauty": "radiance", "object_id": "id"}
+
+_NATIVE = {
+    "radiance": ("R G B",),
+    "normal": ("normal.X normal.Y normal.Z",),
+    "position": ("position.X position.Y position.Z",),
+    "depth": ("depth.Z", "Z"),
+    "motion": ("motion.X motion.Y",),
+    "id": ("id.I",),
+    "alpha": ("A",),
+}
+_IN_OWN_FILE = {3: ("R G B", "X Y Z"), 2: ("X Y", "R G"), 1: ("Z", "I", "Y", "V", "R", "A")}
+_SIGNALS = ("direct", "indirect", "radiance")
+_ABSENT = {
+    "emission": "0: emitters are filtered like everything else",
+    "albedo": "1: textures are filtered together with the light and will blur",
+    "normal": "one direction for all: edges between faces are kept by depth and luminance alone",
+    "depth": "1 everywhere: edges between objects are kept by normals and luminance alone",
+    "motion": "0: what moves, or a camera that does, will leave trails",
+    "id": "one object: surfaces are told apart by depth and normals alone",
+}
+
+
+class Layer(NamedTuple):
+    """The channels of one role; `own_file` if they are in the role's own file (`file`), not in the frame's."""
+
+    channels: tuple[str, ...]
+    own_file: bool
+    reason: str
+
+
+class Roles(NamedTuple):
+    """Layer by role for what is there, and for what is not the default that stands in and what that costs.
+
+    `signals` names the roles that are filtered, in the order of `Frame.radiance`.
+    """
+
+    layers: dict[str, Layer]
+    absent: dict[str, str]
+    signals: tuple[str, ...]
+
+    def describe(self) -> str:
+        """The mapping in one line a role, for people."""
+        lines = [f"{role:9} {' '.join(layer.channels)} ({layer.reason})" for role, layer in self.layers.items()]
+        lines += [f"{role:9} not there, taken as {default}" for role, default in self.absent.items()]
+        return "\n".join(lines)
+
+
+def resolve_roles(
+    channels: Collection[str],
+    *,
+    channel: Mapping[str, Iterable[str]] | None = None,
+    files: Mapping[str, tuple[str, Collection[str]]] | None = None,
+    where: str = "the file",
+) -> Roles:
+    """Find the roles among the channel names of a frame's file.
+
+    Args:
+        channels: names in the frame's file.
+        channel: role -> channel names, given by hand; one name may stand for all three of a colour.
+        files: role -> (file name, its channel names) for roles with a file of their own.
+        where: the frame's file, for messages.
+
+    Raises SvgfError: no radiance, an unknown role, a channel that is not there (the closest names are listed), a role
+    with only some of its channels.
+    """
+    by_hand = {_role(role): tuple(names) for role, names in (channel or {}).items()}
+    own = {_role(role): content for role, content in (files or {}).items()}
+    layers = {}
+    for role in WIDTH:
+        if role in by_hand or role in own:
+            file, names = own.get(role, (where, channels))
+            layers[role] = _given(role, by_hand.get(role), names, file, own_file=role in own)
+        elif layer := _native(role, channels, where):
+            layers[role] = layer
+    asked = by_hand.keys() | own.keys()
+    if "radiance" in asked and asked & {"direct", "indirect"}:
+        raise SvgfError("radiance is the whole beauty; give by hand either it, or direct and indirect.")
+    parts = layers.keys() & {"direct", "indirect"}
+    for role in parts if "radiance" in asked else {"radiance"} if parts else ():
+        layers.pop(role, None)
+    signals = tuple(role for role in _SIGNALS if role in layers)
+    if not signals:
+        raise SvgfError(
+            f"{where}: no radiance; wanted direct.R, direct.G, direct.B and indirect.R ..., or R, G, B. "
+            f"{_nearest(['direct.R', 'indirect.R', 'R', 'radiance.R', 'beauty.R', 'Combined.R'], channels)} "
+            "Say which it is: --channel radiance=NAME,NAME,NAME."
+        )
+    if "radiance" not in layers and "alpha" not in by_hand:
+        layers.pop("alpha", None)
+    return Roles(layers, {role: text for role, text in _ABSENT.items() if role not in layers}, signals)
+
+
+def check_channels(layer: Layer, channels: Collection[str], *, where: str, role: str) -> None:
+    """Raise SvgfError where a later frame lacks a role's channels."""
+    if gone := [name for name in layer.channels if name not in channels]:
+        raise SvgfError(
+            f"{where}: no channel {gone[0]!r}, which is {role} in the frames before. {_nearest(gone, channels)}"
+        )
+
+
+def _role(name: str) -> str:
+    role = ALIASES.get(name, name)
+    if role not in WIDTH:
+        raise SvgfError(f"no role is called {name!r}; roles are {', '.join(WIDTH)}.")
+    return role
+
+
+def _given(role: str, names: tuple[str, ...] | None, there: Collection[str], file: str, *, own_file: bool) -> Layer:
+    """A role that was given by hand: its names, or what a file of its own calls them."""
+    width = WIDTH[role]
+    if names is None:
+        sets = [text.split() for text in (*_spellings(role), *_IN_OWN_FILE[width])]
+        names = next((tuple(names) for names in sets if all(name in there for name in names)), None)
+        if names is None and width == 1 and len(there) == 1:
+            names = tuple(there)
+        if names is None:
+            wanted = " or ".join(" ".join(names) for names in sets)
+            raise SvgfError(
+                f"{file}: channels for {role} not found; wanted {wanted}; there are {', '.join(sorted(there))}. "
+                f"Say which: --channel {role}={','.join(['NAME'] * width)}."
+            )
+        return Layer(names, own_file, "file given by hand")
+    if len(names) == 1 and width == 3 and role not in ("normal", "position"):
+        names = names * 3
+    if len(names) != width:
+        raise SvgfError(f"{role} has {len(names)} channels by hand ({', '.join(names)}); wanted {width}.")
+    if gone := [name for name in names if name not in there]:
+        raise SvgfError(f"{file}: no channel {gone[0]!r} for {role}. {_nearest(gone, there)}")
+    return Layer(names, own_file, "given by hand")
+
+
+def _native(role: str, channels: Collection[str], where: str) -> Layer | None:
+    for text in _spellings(role):
+        names = tuple(text.split())
+        there = [name for name in names if name in channels]
+        if len(there) == len(names):
+            return Layer(names, False, "native name" if text == _spellings(role)[0] else "standard name")
+        if there and role != "radiance":
+            gone = next(name for name in names if name not in channels)
+            raise SvgfError(
+                f"{where}: {', '.join(there)} but no {gone}; wanted all of {role}. {_nearest([gone], channels)}"
+            )
+    return None
+
+
+def _spellings(role: str) -> tuple[str, ...]:
+    return _NATIVE.get(role, (f"{role}.R {role}.G {role}.B",))
+
+
+def _nearest(wanted: Iterable[str], channels: Collection[str]) -> str:
+    """The closest names that are there, for an error message."""
+    close = [name for want in wanted for name in difflib.get_close_matches(want, channels, n=4, cutoff=0.5)]
+    if close:
+        return f"Closest: {', '.join(list(dict.fromkeys(close))[:6])}."
+    names = sorted(channels)
+    return f"There are {', '.join(names[:12])}" + (f" and {len(names) - 12} more." if len(names) > 12 else ".")
