@@ -2,6 +2,8 @@
 
 import importlib
 import os
+import shutil
+import uuid
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
@@ -75,6 +77,11 @@ def write_video(path: str | Path, pictures: Iterable[np.ndarray], *, fps: float 
     _write_atomically(path, encode, av.FFmpegError)
 
 
+def copy_file(source: str | Path, path: str | Path) -> None:
+    """Copy a file, under a temporary name and then renamed. `SvgfError` where that fails."""
+    _write_atomically(path, lambda temporary: shutil.copyfile(source, temporary) and None)
+
+
 def require_video() -> None:
     """Raise `SvgfError` where the extra `video` is not installed, so that a long job finds out before it starts."""
     _av()
@@ -93,7 +100,7 @@ def _av():
 
 def _write_atomically(path: str | Path, write: Callable[[str], None], *failures: type[Exception]) -> None:
     """Call `write(temporary name in the same folder)`, make it durable, rename it to `path`."""
-    temporary = f"{path}.{os.getpid()}.tmp"
+    temporary = str(Path(path).with_name(f".{Path(path).name}.{uuid.uuid4().hex[:8]}.tmp"))
     try:
         write(temporary)
         with open(temporary, "rb+") as file:

@@ -1,0 +1,178 @@
+"""What a run keeps in its output folder so that it can be resumed: a lock, its identity, the history. No JAX.
+
+All of it lies in `OUT/.svgf-jax/`: `lock` (held by the operating system for as long as the process lives), `run.json`
+(what is being computed: parameters, inputs, options) and `checkpoint.npz` (the history after so many frames). Every
+file is replaced atomically and carries data only; nothing in it is ever executed.
+"""
+
+import json
+import os
+import socket
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+
+from svgf_jax.types import History, SvgfError
+
+FOLDER = ".svgf-jax"
+FORMAT = 1  # of the files in FOLDER
+
+Identity = dict[
+    str, Any
+]  # JSON: whatever two runs must share to be the same run; its "frames" lists the inputs in order
+
+
+class Checkpoint(NamedTuple):
+    """The state between two frames: the next frame's index, and the history (None = no past) as NumPy arrays."""
+
+    next_index: int
+    history: History | None
+
+
+@contextmanager
+def lock(out: Path) -> Iterator[None]:
+    """Hold `out`, creating it and its state folder, so that no second run writes there; `SvgfError` if one does.
+
+    The lock dies with its process, however that ends. Where the file system has no locks, it is silently no protection.
+    """
+    try:
+        (out / FOLDER).mkdir(parents=True, exist_ok=True)
+        file = open(out / FOLDER / "lock", "a+")  # noqa: SIM115 (closed below; open for as long as the lock is held)
+    except OSError as error:
+        raise SvgfError(
+            f"Cannot write into the output folder {out}: {error.strerror or error}. "
+            "Wanted a folder that is writable or can be created; try another one."
+        ) from error
+    with file:
+        if not _try_lock(file):
+            file.seek(0)
+            raise SvgfError(
+                f"Another run is writing into {out} ({file.read().strip() or 'unknown process'}). "
+                "Wait for it to end, or choose another output folder."
+            )
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        file.flush()
+        yield
+
+
+def save_run(out: Path, identity: Identity, *, complete: bool) -> None:
+    """Record what is being computed into `out`, and whether it is all there."""
+    text = json.dumps({"format": FORMAT, "complete": complete, "identity": identity}, indent=1)
+    _replace(out / FOLDER / "run.json", lambda file: file.write(text.encode()))
+
+
+def load_run(out: Path) -> tuple[Identity, bool] | None:
+    """(identity, complete) of the run recorded in `out`; None if there is no record."""
+    path = out / FOLDER / "run.json"
+    try:
+        record = json.loads(path.read_text())
+        if record["format"] != FORMAT or not isinstance(record["identity"]["frames"], list):
+            raise ValueError(f"format {record['format']}, wanted {FORMAT}")
+        return record["identity"], bool(record["complete"])
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise _unusable(path, error) from error
+
+
+def save_checkpoint(out: Path, identity: Identity, checkpoint: Checkpoint) -> None:
+    """Replace the checkpoint in `out`. Only to be called when every output before `next_index` is on disk."""
+    arrays = {} if checkpoint.history is None else checkpoint.history._asdict()
+    entries = {
+        **{name: np.asarray(array) for name, array in arrays.items()},
+        "format": np.asarray(FORMAT),
+        "next_index": np.asarray(checkpoint.next_index),
+        "identity": np.frombuffer(json.dumps(identity).encode(), np.uint8),
+    }
+    _replace(out / FOLDER / "checkpoint.npz", lambda file: np.savez(file, **entries))
+
+
+def load_checkpoint(out: Path, identity: Identity) -> Checkpoint | None:
+    """The checkpoint in `out`, None if there is none; `SvgfError` if it is damaged or belongs to another computation.
+
+    The inputs still to come may differ from what they were (a frame repaired, frames added); those used may not.
+    """
+    path = out / FOLDER / "checkpoint.npz"
+    try:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+            entries = {name: file[name] for name in file.files}
+        if int(entries["format"]) != FORMAT:
+            raise ValueError(f"format {entries['format']}, wanted {FORMAT}")
+        next_index = int(entries["next_index"])
+        saved = json.loads(entries["identity"].tobytes().decode())
+        arrays = [entries[name] for name in History._fields if name in entries]
+        if len(arrays) not in (0, len(History._fields)) or not 0 <= next_index <= len(saved["frames"]):
+            raise ValueError("incomplete")
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise _unusable(path, error) from error
+    check_same(out, saved, identity, used=next_index)
+    return Checkpoint(next_index, History(*arrays) if arrays else None)
+
+
+def check_same(out: Path, saved: Identity, identity: Identity, *, used: int) -> None:
+    """Raise `SvgfError` naming the first difference between two identities, over the first `used` frames."""
+    head = f"Cannot resume the run in {out}: "
+    tail = " Run it as it was begun, or start again with --overwrite (or into another folder)."
+    for index in range(used):
+        then, now = saved["frames"][index], (identity["frames"][index : index + 1] or [None])[0]
+        if then != now:
+            raise SvgfError(f"{head}its input frame {index + 1} was {then}, and is {now} now.{tail}")
+    for key, then, now in _differences(saved, identity):
+        raise SvgfError(f"{head}{key} was {then}, and is {now} now.{tail}")
+
+
+def remove_checkpoint(out: Path) -> None:
+    """Forget the history; the record in run.json stays."""
+    (out / FOLDER / "checkpoint.npz").unlink(missing_ok=True)
+
+
+def _differences(saved: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """(dotted name, then, now) of every leaf in which two JSON trees differ, frames left out."""
+    if isinstance(saved, dict) and isinstance(now, dict):
+        for key in sorted(saved.keys() | now.keys()):
+            if (name, key) != ("", "frames"):
+                yield from _differences(saved.get(key), now.get(key), f"{name}.{key}" if name else key)
+    elif saved != now:
+        yield name, saved, now
+
+
+def _unusable(path: Path, error: Exception) -> SvgfError:
+    return SvgfError(
+        f"Cannot resume from {path}: it is damaged or of another version ({error}). "
+        "Start again with --overwrite, or into another folder."
+    )
+
+
+def _replace(path: Path, write: Callable[[BinaryIO], Any]) -> None:
+    """Write a file under a temporary name, make it durable and rename it."""
+    temporary = path.with_name(f"{path.name}.tmp")  # one name: the folder is locked, and a killed run's is written over
+    try:
+        with open(temporary, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise SvgfError(f"Could not write {path}: {error}. Check that the disk is not full.") from error
+
+
+def _try_lock(file: Any) -> bool:
+    """Take an exclusive lock on an open file without waiting: whether it was free."""
+    try:
+        import fcntl
+    except ImportError:  # Windows: its file locks would also keep others from reading who holds it
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True

@@ -1,0 +1,171 @@
+"""What a run will write, checked before it starts: output names, collisions, and where a resumed run begins. No JAX."""
+
+import os
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from svgf_jax import checkpoint
+from svgf_jax.checkpoint import Checkpoint, Identity
+from svgf_jax.types import SvgfError
+
+Files = Sequence[tuple[int, str | None]]
+
+
+class Plan(NamedTuple):
+    """The files of a run.
+
+    Attributes:
+        out: the output folder.
+        files: (frame number, input file or None if missing), in order.
+        outputs: for each the EXR to write, under the input's name; None for a missing frame that is not held.
+        png: whether each EXR has a PNG beside it.
+        video: the video to write, if any.
+        identity: what the run computes, to recognise it by when it is resumed.
+    """
+
+    out: Path
+    files: Files
+    outputs: tuple[Path | None, ...]
+    png: bool
+    video: Path | None
+    identity: Identity
+
+
+def make_plan(files: Files, out: Path, *, hold: bool, png: bool, video: bool, identity: Identity) -> Plan:
+    """Name the outputs. `hold`: missing frames get one too. `identity` is all of it but the frames, which are added.
+
+    Raises SvgfError: `out` is a file or names one, an output would be an input, nothing there to hold.
+    """
+    if out.suffix.lower() == ".exr" or re.search(r"[#%*?@]", out.name) or out.is_file():
+        raise SvgfError(
+            f"Got {out} as the output; wanted a folder, for example {out.parent / 'denoised'}. "
+            "The files in it get the names of the inputs."
+        )
+    if hold and files and files[0][1] is None:
+        raise SvgfError(
+            f"Frame {files[0][0]} is missing, and there is none before it whose output could be held. "
+            "Begin with a frame that is there (--frames), or use --missing reset."
+        )
+    names = _output_names(files, hold=hold)
+    planned = tuple(None if name is None else out / name for name in names)
+    inputs = {os.path.realpath(path) for _, path in files if path is not None}
+    for path in planned:
+        if path is not None and os.path.realpath(path) in inputs:
+            raise SvgfError(f"The output {path} would replace an input. Choose another output folder.")
+    film = out / (_stem(next((name for name in names if name), "")) + ".mp4") if video else None
+    return Plan(out, files, planned, png, film, identity | {"frames": [_stamp(number, path) for number, path in files]})
+
+
+def begin(plan: Plan, *, resume: bool, overwrite: bool) -> Checkpoint | None:
+    """Where to start, None if the run is complete already. To be called with the output folder locked.
+
+    Records the run in the folder and removes temporary files that a killed one left. Raises SvgfError: outputs exist
+    and neither option is given, the run to resume computed something else or has lost its outputs.
+    """
+    if resume and overwrite:
+        raise SvgfError("Got both resume and overwrite: one continues a run, the other starts it again. Choose one.")
+    start = _resume(plan) if resume else _start(plan, overwrite=overwrite)
+    if start is not None:
+        _remove_temporary(plan)
+        checkpoint.save_run(plan.out, plan.identity, complete=False)
+    return start
+
+
+def written(plan: Plan, frames: int | None = None) -> Iterator[Path]:
+    """The files that the first `frames` frames produce (all: None), previews included, the video last."""
+    for path in plan.outputs[:frames]:
+        if path is not None:
+            yield path
+            if plan.png:
+                yield path.with_suffix(".png")
+    if frames is None and plan.video is not None:
+        yield plan.video
+
+
+def _start(plan: Plan, *, overwrite: bool) -> Checkpoint:
+    there = [path for path in written(plan) if path.exists()]
+    if there and not overwrite:
+        record = checkpoint.load_run(plan.out)
+        hint = "--resume continues the unfinished run, " if record is not None and not record[1] else ""
+        raise SvgfError(
+            f"{_list(there)} in {plan.out} exist{'s' if len(there) == 1 else ''} already, and nothing is overwritten "
+            f"unasked. Choose another output folder, or: {hint}--overwrite replaces them."
+        )
+    checkpoint.remove_checkpoint(plan.out)
+    return Checkpoint(0, None)
+
+
+def _resume(plan: Plan) -> Checkpoint | None:
+    record = checkpoint.load_run(plan.out)
+    if record is None:  # never begun: a farm's script may always say resume
+        return _start(plan, overwrite=False)
+    saved, complete = record
+    if complete:
+        checkpoint.check_same(plan.out, saved, plan.identity, used=len(saved["frames"]))
+        if len(saved["frames"]) != len(plan.files):
+            raise SvgfError(
+                f"The run in {plan.out} is complete with {len(saved['frames'])} frames; the input has now "
+                f"{len(plan.files)}. Use --overwrite, or another output folder, to denoise them all."
+            )
+        _check_there(plan, None)
+        return None
+    start = checkpoint.load_checkpoint(plan.out, plan.identity)
+    if start is None:
+        checkpoint.check_same(plan.out, saved, plan.identity, used=0)
+        return Checkpoint(0, None)
+    _check_there(plan, start.next_index)
+    return start
+
+
+def _check_there(plan: Plan, frames: int | None) -> None:
+    if gone := [path for path in written(plan, frames) if not path.exists()]:
+        raise SvgfError(
+            f"Cannot resume the run in {plan.out}: {_list(gone)}, written before, "
+            f"{'is' if len(gone) == 1 else 'are'} gone. Start again with --overwrite."
+        )
+
+
+def _remove_temporary(plan: Plan) -> None:
+    """Remove what a killed run was writing: `.NAME.*.tmp` for the names of this plan, and nothing else."""
+    names = {path.name for path in written(plan)}
+    for path in plan.out.glob(".*.tmp"):
+        if path.name[1:].rsplit(".", 2)[0] in names:
+            path.unlink(missing_ok=True)
+
+
+def _output_names(files: Files, *, hold: bool) -> list[str | None]:
+    """The inputs' own names; for a missing frame the name before it with its number put in."""
+    names: list[str | None] = []
+    latest, latest_number = "", 0
+    for number, path in files:
+        if path is not None:
+            latest, latest_number = Path(path).stem + ".exr", number
+            names.append(latest)
+        elif hold:
+            digits = [digits for digits in re.findall(r"\d+", latest) if int(digits) == abs(latest_number)][-1]
+            head, tail = latest.rsplit(digits, 1)
+            names.append(f"{head}{number:0{len(digits)}d}{tail}")
+        else:
+            names.append(None)
+    return names
+
+
+def _stem(name: str) -> str:
+    """`shot.0001.exr` -> `shot`; `denoised` for a name that is nothing but a number."""
+    return re.sub(r"[._-]*-?\d+$", "", Path(name).stem) or "denoised"
+
+
+def _stamp(number: int, path: str | None) -> list:
+    """What tells that an input is still the same file."""
+    if path is None:
+        return [number, None]
+    status = os.stat(path)
+    return [number, Path(path).name, status.st_size, status.st_mtime_ns]
+
+
+def _list(paths: list[Path]) -> str:
+    """At most three names."""
+    names = ", ".join(path.name for path in paths[:3])
+    return names if len(paths) <= 3 else f"{names} and {len(paths) - 3} more"
