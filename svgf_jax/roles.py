@@ -106,8 +106,8 @@ def resolve_roles(
     Raises SvgfError: no radiance, an unknown role, a channel that is not there (the closest names are listed), a role
     with only some of its channels.
     """
-    by_hand = {_role(role): tuple(names) for role, names in (channel or {}).items()}
-    own = {_role(role): content for role, content in (files or {}).items()}
+    by_hand = {canonical_role(role): tuple(names) for role, names in (channel or {}).items()}
+    own = {canonical_role(role): content for role, content in (files or {}).items()}
     layers = {}
     for role in WIDTH:
         if role in by_hand or role in own:
@@ -141,7 +141,8 @@ def check_channels(layer: Layer, channels: Collection[str], *, where: str, role:
         )
 
 
-def _role(name: str) -> str:
+def canonical_role(name: str) -> str:
+    """The role that a name given by hand means. Raises SvgfError."""
     role = ALIASES.get(name, name)
     if role not in WIDTH:
         raise SvgfError(f"no role is called {name!r}; roles are {', '.join(WIDTH)}.")

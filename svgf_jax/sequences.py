@@ -77,7 +77,9 @@ def find_sequence(
     return Sequence(tuple((number, found.get(number)) for number in wanted), text, padding, missing)
 
 
-def companion(sequence: Sequence, pattern: PathName, *, partial: bool = False) -> Sequence:
+def companion(
+    sequence: Sequence, pattern: PathName, *, partial: bool = False, prefer: tuple[str, ...] = ("frame",)
+) -> Sequence:
     """The files of another pattern (or one file for all frames) with the frame numbers of `sequence`.
 
     A relative pattern may also be meant beside the sequence's own files. Raises SvgfError where a frame that the
@@ -88,7 +90,7 @@ def companion(sequence: Sequence, pattern: PathName, *, partial: bool = False) -
     text = next((place for place in (text, beside) if os.path.exists(place) or _match(place)[0]), text)
     if os.path.isfile(text):
         return sequence._replace(files=tuple((number, text) for number, _ in sequence.files), name=text, padding=0)
-    other = find_sequence(text, missing="hold")
+    other = find_sequence(text, missing="hold", prefer=prefer)
     paths = dict(other.files)
     files = tuple((number, paths.get(number)) for number, _ in sequence.files)
     gaps = [number for (number, path), (_, own) in zip(files, sequence.files, strict=True) if own and not path]

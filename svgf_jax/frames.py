@@ -1,0 +1,282 @@
+"""From files to frames: open a sequence, read its frames as NumPy arrays in the conventions of `svgf_jax.types`.
+
+A pixel has no surface (`object_id` -1) if any of what is there says so: id -1, alpha 0, a zero normal, a depth that
+is not finite, <= 0 or >= 1e8. Its guides become 0. Normals are brought to unit length. Radiance is left as it is:
+what is not finite in it the filter repairs and counts.
+"""
+
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from svgf_jax import exr
+from svgf_jax.cameras import Cameras, find_camera, load_cameras, reproject
+from svgf_jax.exr_layout import PathName, Window
+from svgf_jax.roles import Roles, canonical_role, check_channels, resolve_roles
+from svgf_jax.sequences import Missing, Sequence, companion, find_sequence
+from svgf_jax.types import Frame, SvgfError
+
+FAR = 1e8
+"""Depths from here on are the renderers' way of saying that nothing was hit."""
+
+
+class Source(NamedTuple):
+    """A sequence ready to be read: every file found, every role resolved.
+
+    Attributes:
+        sequence: the frames' files; `sequence.missing` says what a missing one means.
+        roles: which channel plays which role.
+        files: the files of the roles that have their own.
+        half: the roles that are stored in half float.
+        cameras: from cameras.json, if there is one.
+        data_window, display_window: of the first frame; every frame must have the same.
+        warnings: what the user should know before the work starts, as sentences.
+        max_pixels: largest picture that will be read.
+    """
+
+    sequence: Sequence
+    roles: Roles
+    files: dict[str, Sequence]
+    half: frozenset[str]
+    cameras: Cameras | None
+    data_window: Window
+    display_window: Window
+    warnings: tuple[str, ...]
+    max_pixels: int
+
+
+class LoadedFrame(NamedTuple):
+    """One frame, read.
+
+    Attributes:
+        frame: NumPy arrays, float32 (`object_id` int32).
+        number, path: frame number and main file.
+        image: the main file as it was, to pass its other layers through.
+        counts: pixels repaired, by reason: `normal` (not of unit length by more than 1 %), `guides` (a hit by id or
+            alpha, but no usable depth or normal), `excess` (emission above the beauty that should contain it).
+        notes: what else is odd about it, as sentences.
+    """
+
+    frame: Frame
+    number: int
+    path: str
+    image: exr.Image
+    counts: dict[str, int]
+    notes: tuple[str, ...]
+
+
+def open_source(
+    pattern: PathName,
+    *,
+    frames: str | None = None,
+    missing: Missing = "error",
+    channel: Mapping[str, Iterable[str]] | None = None,
+    file: Mapping[str, PathName] | None = None,
+    cameras: PathName | None = "auto",
+    max_pixels: int = exr.MAX_PIXELS,
+) -> Source:
+    """Find the files of a sequence and settle the roles by the first frame's header; no pixel is read.
+
+    Args:
+        pattern: a folder, a pattern such as `frame_####.exr`, or one file.
+        frames: a range such as `1-100`, `1-100x2`; all that are there if None.
+        missing: what to do about missing frames: "error", "hold" or "reset".
+        channel: role -> channel names, where they are not the native ones (see `svgf_jax.roles`).
+        file: role -> pattern of files that hold this role.
+        cameras: a cameras.json; "auto" takes the one beside the frames if there is one, None none.
+        max_pixels: refuse larger pictures.
+
+    Raises SvgfError: whatever is missing or unclear, naming the file.
+    """
+    sequence = find_sequence(pattern, frames=frames, missing=missing)
+    at, path = next((i, path) for i, (_, path) in enumerate(sequence.files) if path is not None)
+    header = exr.read_header(path)
+    files = {canonical_role(role): companion(sequence, where) for role, where in (file or {}).items()}
+    own = {role: (str(other.files[at][1]), exr.read_header(str(other.files[at][1]))) for role, other in files.items()}
+    names = {role: (name, tuple(other.channels)) for role, (name, other) in own.items()}
+    roles = resolve_roles(tuple(header.channels), channel=channel, files=names, where=path)
+    files = {role: other for role, other in files.items() if role in roles.layers}
+    found = _find_cameras(cameras, sequence, header, path)
+    if found and roles.layers.keys() & {"depth", "position"} and "motion" not in roles.layers:
+        roles = roles._replace(absent=roles.absent | {"motion": f"{found.path} says"})
+    half = set()
+    for role, layer in roles.layers.items():
+        types = own[role][1].channels if layer.own_file else header.channels
+        if np.dtype(np.float16) in {types[name] for name in layer.channels}:
+            half.add(role)
+    warnings = tuple(_warnings(roles, half, found))
+    return Source(
+        sequence, roles, files, frozenset(half), found, header.data_window, header.display_window, warnings, max_pixels
+    )
+
+
+def read_frame(source: Source, index: int) -> LoadedFrame:
+    """Read the frame `source.sequence.files[index]`. May be called from several threads at once.
+
+    Raises SvgfError that names the file: missing, unreadable, of another size than the first frame, without a channel.
+    """
+    number, path = source.sequence.files[index]
+    if path is None:
+        raise SvgfError(f"{source.sequence.name}: frame {number} is missing; render it, or go on without (--missing).")
+    images = {path: _read(path, source)}
+    planes: dict[str, np.ndarray] = {}
+    for role, layer in source.roles.layers.items():
+        where = str(source.files[role].files[index][1]) if layer.own_file else path
+        if where not in images:
+            images[where] = _read(where, source)
+        check_channels(layer, images[where].channels, where=where, role=role)
+        planes[role] = _stack(images[where], layer.channels)
+    counts: dict[str, int] = {}
+    notes: list[str] = []
+    with np.errstate(all="ignore"):  # whatever is not finite is dealt with by name below, or by the filter
+        radiance, emission = _light(source.roles.signals, planes, counts)
+        object_id, normal, depth = _guides(planes, radiance.shape[1:3], counts)
+        motion, prev_depth = _past(source, index, planes, depth, object_id, notes)
+        if "id" in source.half and (largest := np.fmax.reduce(planes["id"], axis=None)) > 2048:
+            notes.append(
+                f"object ids up to {largest:.0f} in half float: above 2048 neighbouring ids become one. "
+                "Let the renderer write ids as 32-bit."
+            )
+    albedo = planes["albedo"] if "albedo" in planes else np.ones_like(emission)
+    arrays: list[Any] = [radiance, albedo[None], emission, normal, depth, prev_depth, motion, object_id]
+    counts = {reason: count for reason, count in counts.items() if count}
+    return LoadedFrame(Frame(*arrays), number, path, images[path], counts, tuple(notes))
+
+
+def load_sequence(pattern: PathName, **options: Any) -> Frame:
+    """All frames of a sequence stacked along a leading T, ready for `svgf_jax.denoise`. Options: see `open_source`."""
+    source = open_source(pattern, **options)
+    with ThreadPoolExecutor(4) as pool:
+        frames = list(pool.map(lambda index: read_frame(source, index).frame, range(len(source.sequence.files))))
+    stacked: list[Any] = [np.stack(planes) for planes in zip(*frames, strict=True)]
+    return Frame(*stacked)
+
+
+def _light(
+    signals: tuple[str, ...], planes: dict[str, np.ndarray], counts: dict[str, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance `[S, H, W, 3]` and emission `[H, W, 3]`; from a beauty, which contains it, the emission is taken off."""
+    radiance = np.stack([planes[role] for role in signals])
+    emission = planes["emission"] if "emission" in planes else np.zeros_like(radiance[0])
+    if signals == ("radiance",) and "emission" in planes:
+        known = np.where(np.isfinite(emission), emission, 0)
+        reflected = radiance - known
+        slack = 2.0**-9 * np.abs(known)  # half-float rounding of both
+        counts["excess"] = int((reflected < -slack).any(-1).sum())
+        radiance = np.maximum(reflected, 0)  # NaN stays NaN
+    return radiance, emission
+
+
+def _guides(
+    planes: dict[str, np.ndarray], shape: tuple[int, ...], counts: dict[str, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """object_id, normal (unit) and depth; 0 where there is no surface, which is decided here."""
+    ids = np.zeros(shape, np.int32)
+    hit = np.ones(shape, bool)
+    if "id" in planes:
+        given = planes["id"][..., 0]
+        ids = np.where(np.isfinite(given), np.rint(given), -1).astype(np.int64).astype(np.int32)  # uint32 wraps round
+        hit = ids != -1
+    if "alpha" in planes:
+        hit &= ~(planes["alpha"][..., 0] == 0)
+    surface = hit.copy()
+    normal = planes.get("normal", np.broadcast_to(np.array([0, 0, 1], np.float32), (*shape, 3)))
+    length = np.sqrt((normal * normal).sum(-1, dtype=np.float32))
+    surface &= ~(length == 0)  # one that is not finite counts as a surface that the filter drops and counts
+    depth = planes["depth"][..., 0] if "depth" in planes else np.ones(shape, np.float32)
+    surface &= (depth > 0) & (depth < FAR)
+    if "id" in planes or "alpha" in planes:
+        counts["guides"] = int((hit & ~surface & ~(depth >= FAR)).sum())
+    counts["normal"] = int((surface & (np.abs(length - 1) > 0.01)).sum())
+    normal = np.where(surface[..., None], normal / length[..., None], 0).astype(np.float32)
+    return np.where(surface, ids, -1).astype(np.int32), normal, np.where(surface, depth, 0).astype(np.float32)
+
+
+def _past(
+    source: Source,
+    index: int,
+    planes: dict[str, np.ndarray],
+    depth: np.ndarray,
+    object_id: np.ndarray,
+    notes: list[str],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Motion `[H, W, 2]` and prev_depth `[H, W]` with respect to the frame that is read before this one."""
+    number = source.sequence.files[index][0]
+    before = [other for other, path in source.sequence.files[:index] if path is not None]
+    motion = planes.get("motion", np.zeros((*depth.shape, 2), np.float32))
+    prev_depth = depth
+    skipped = bool(before) and before[-1] != number - 1
+    if before and source.cameras and planes.keys() & {"depth", "position"}:
+        (left, top, *_), (screen_left, screen_top, *_) = source.data_window, source.display_window
+        prev_depth, derived = reproject(
+            source.cameras,
+            depth,
+            object_id,
+            number=number,
+            previous=before[-1],
+            position=planes.get("position"),
+            origin=(left - screen_left, top - screen_top),
+        )
+        if skipped or "motion" not in planes:
+            motion = derived
+    elif skipped and "motion" in planes:
+        notes.append(
+            f"frame {number} follows frame {before[-1]}, but its motion vectors lead to frame {number - 1}; "
+            "a cameras.json would tell the whole way."
+        )
+    sky = (object_id == -1)[..., None]
+    return np.where(sky & ~np.isfinite(motion), 0, motion).astype(np.float32), prev_depth
+
+
+def _read(path: str, source: Source) -> exr.Image:
+    image = exr.read(path, max_pixels=source.max_pixels)
+    if (image.data_window, image.display_window) != (source.data_window, source.display_window):
+        raise SvgfError(
+            f"{path}: data window {image.data_window} of {image.display_window}; wanted {source.data_window} of "
+            f"{source.display_window}, as in the first frame. Render all files in one size, or denoise the parts as "
+            "sequences of their own (--frames)."
+        )
+    return image
+
+
+def _stack(image: exr.Image, channels: tuple[str, ...]) -> np.ndarray:
+    """`[H, W, C]` float32, or float64 for 32-bit integers, which float32 does not hold."""
+    planes = np.stack([image.channels[name] for name in channels], -1)
+    return planes.astype(np.float64 if planes.dtype == np.uint32 else np.float32)
+
+
+def _find_cameras(wanted: PathName | None, sequence: Sequence, header: exr.Header, first: str) -> Cameras | None:
+    if wanted is None:
+        return None
+    path = os.path.join(os.path.dirname(first), "cameras.json") if wanted == "auto" else os.fspath(wanted)
+    if wanted == "auto" and not os.path.isfile(path):
+        return None
+    try:
+        cameras = load_cameras(path)
+        for number, file in sequence.files:
+            if file is not None:
+                find_camera(cameras, number)
+    except SvgfError as error:
+        raise SvgfError(f"{error} To go on without it: --cameras none (cameras=None).") from error
+    left, top, right, bottom = header.display_window
+    size = (right - left + 1, bottom - top + 1)
+    if cameras.size not in (None, size):
+        raise SvgfError(
+            f"{path}: cameras for pictures of {cameras.size}, but {first} shows {size}. "
+            "Wanted the same size; to go on without it: --cameras none (cameras=None)."
+        )
+    return cameras
+
+
+def _warnings(roles: Roles, half: set[str], cameras: Cameras | None) -> Iterator[str]:
+    for role in ("albedo", "normal", "depth", "motion"):
+        if role in roles.absent and not (role == "motion" and cameras):
+            yield f"no {role}: taken as {roles.absent[role]}."
+    for role in ("depth", "position"):
+        if role in half:
+            yield f"{role} is in half float, in steps of 0.1 %: slopes become stairs. Let the renderer write 32-bit."
+    if cameras and not roles.layers.keys() & {"depth", "position"}:
+        yield f"{cameras.path} is of no use without depth or position."
