@@ -33,8 +33,12 @@ class Plan(NamedTuple):
     identity: Identity
 
 
-def make_plan(files: Files, out: Path, *, hold: bool, png: bool, video: bool, identity: Identity) -> Plan:
-    """Name the outputs. `hold`: missing frames get one too. `identity` is all of it but the frames, which are added.
+def make_plan(
+    files: Files, out: Path, *, hold: bool, png: bool, video: bool, identity: Identity, others: Sequence[Files] = ()
+) -> Plan:
+    """Name the outputs. `hold`: missing frames get one too. `others`: further files of the same frames.
+
+    `identity` is all of what the run computes but its input frames, which are added here.
 
     Raises SvgfError: `out` is a file or names one, an output would be an input, nothing there to hold.
     """
@@ -55,7 +59,8 @@ def make_plan(files: Files, out: Path, *, hold: bool, png: bool, video: bool, id
         if path is not None and os.path.realpath(path) in inputs:
             raise SvgfError(f"The output {path} would replace an input. Choose another output folder.")
     film = out / (_stem(next((name for name in names if name), "")) + ".mp4") if video else None
-    return Plan(out, files, planned, png, film, identity | {"frames": [_stamp(number, path) for number, path in files]})
+    stamps = [[files[i][0], *(stamp(sequence[i][1]) for sequence in (files, *others))] for i in range(len(files))]
+    return Plan(out, files, planned, png, film, identity | {"frames": stamps})
 
 
 def begin(plan: Plan, *, resume: bool, overwrite: bool) -> Checkpoint | None:
@@ -82,6 +87,14 @@ def written(plan: Plan, frames: int | None = None) -> Iterator[Path]:
                 yield path.with_suffix(".png")
     if frames is None and plan.video is not None:
         yield plan.video
+
+
+def stamp(path: str | None) -> list | None:
+    """What tells that an input is still the same file: name, size, time of change."""
+    if path is None:
+        return None
+    status = os.stat(path)
+    return [Path(path).name, status.st_size, status.st_mtime_ns]
 
 
 def _start(plan: Plan, *, overwrite: bool) -> Checkpoint:
@@ -155,14 +168,6 @@ def _output_names(files: Files, *, hold: bool) -> list[str | None]:
 def _stem(name: str) -> str:
     """`shot.0001.exr` -> `shot`; `denoised` for a name that is nothing but a number."""
     return re.sub(r"[._-]*-?\d+$", "", Path(name).stem) or "denoised"
-
-
-def _stamp(number: int, path: str | None) -> list:
-    """What tells that an input is still the same file."""
-    if path is None:
-        return [number, None]
-    status = os.stat(path)
-    return [number, Path(path).name, status.st_size, status.st_mtime_ns]
 
 
 def _list(paths: list[Path]) -> str:

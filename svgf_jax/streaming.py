@@ -1,0 +1,303 @@
+"""A whole sequence from disk to disk: read ahead, filter, write behind, resume. Memory does not grow with its length.
+
+JAX is imported once the first frame has been read, so that every error before that is answered at once.
+"""
+
+import contextlib
+import os
+import shutil
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from svgf_jax import __version__, checkpoint, exr, frames, outputs, preview
+from svgf_jax.checkpoint import Checkpoint
+from svgf_jax.compiled import Filters, Pipeline, compile_filters, to_host
+from svgf_jax.outputs import WriteOptions
+from svgf_jax.plan import Plan, begin, make_plan, stamp, written
+from svgf_jax.threads import Submit, read_ahead, write_behind
+from svgf_jax.types import Config, History, Output, Params, SvgfError
+
+
+class FrameReport(NamedTuple):
+    """What became of one frame.
+
+    Attributes:
+        number: the frame number.
+        status: "filtered", "held" (missing: the frame before it written again) or "skipped" (missing: nothing written).
+        path: the output, None if skipped.
+        counts: pixels repaired on loading, before filtering and on writing, by reason; only those above 0.
+        notes: anything else worth telling, as sentences.
+    """
+
+    number: int
+    status: str
+    path: Path | None
+    counts: dict[str, int]
+    notes: tuple[str, ...]
+
+
+class Summary(NamedTuple):
+    """What a run did.
+
+    Attributes:
+        out: the output folder.
+        frames: frames in the sequence.
+        resumed_at: how many of them an earlier run had done; 0 unless resumed.
+        statuses: frames of this run by status ("filtered", "held", "skipped").
+        counts: repaired pixels by reason, summed over this run's frames.
+        notes: each distinct note of this run's frames.
+        interrupted: stopped before the end; `run(..., resume=True)` continues.
+        device: what computed, for example "cpu"; "" if there was nothing left to do.
+        video: the video, if one was written.
+        seconds: wall-clock time of this run, compilation included.
+    """
+
+    out: Path
+    frames: int
+    resumed_at: int
+    statuses: dict[str, int]
+    counts: dict[str, int]
+    notes: tuple[str, ...]
+    interrupted: bool
+    device: str
+    video: Path | None
+    seconds: float
+
+
+def run(
+    source: frames.Source,
+    out: str | Path,
+    *,
+    params: Params = Params(),  # noqa: B008 (immutable)
+    config: Config = Config(),  # noqa: B008
+    preset: str = "",
+    options: WriteOptions = WriteOptions(),  # noqa: B008
+    video: bool = False,
+    fps: float = 24.0,
+    resume: bool = False,
+    overwrite: bool = False,
+    device: str | None = None,
+    checkpoint_every: int = 8,
+    threads: int = 2,
+    on_frame: Callable[[FrameReport], None] = lambda report: None,
+    stop: Callable[[], bool] = lambda: False,
+    pipeline: Pipeline | None = None,
+) -> Summary:
+    """Denoise `source` into the folder `out`, one EXR a frame under the input's name.
+
+    Every file appears complete or not at all. Every `checkpoint_every` frames, once their outputs are on disk, the
+    history is saved; `resume` continues after that, rewriting what came later, and the result is the same bit for bit.
+    A missing frame is held (the output before it is written again, the history kept) or resets the history, as
+    `source.sequence.missing` says.
+
+    Args:
+        preset: the name written into the outputs' attributes.
+        video: also encode `OUT/NAME.mp4` at `fps` once all frames are there.
+        resume: continue an interrupted run; begin one where there is none. Excludes `overwrite`.
+        overwrite: replace outputs that exist; without it they are an error.
+        device: "cpu", "gpu", "gpu:1", ...; None takes JAX's default.
+        threads: frames read ahead, and outputs written behind.
+        on_frame: called in this thread for each frame once its output is complete, in order.
+        stop: asked after each frame; True ends the run with a checkpoint.
+        pipeline: `(init, step)` in place of `svgf_jax.pipeline`'s.
+
+    Raises:
+        SvgfError: unreadable or mismatching input, an unusable output folder, existing outputs, a checkpoint of another
+            computation, a full disk. What is complete stays, and `resume` continues from there.
+    """
+    began = time.monotonic()
+    if checkpoint_every < 1 or threads < 1:
+        raise SvgfError(f"Got checkpoint_every {checkpoint_every} and threads {threads}; wanted at least 1 of each.")
+    if video:
+        preview.require_video()
+    provenance = outputs.attributes(os.path.abspath(source.sequence.name), preset=preset, params=params, config=config)
+    plan = make_plan(
+        source.sequence.files,
+        Path(out),
+        hold=source.sequence.missing == "hold",
+        png=options.png,
+        video=video,
+        identity=_identity(source, options, provenance) | outputs.numbers(params, config),
+        others=[other.files for other in source.files.values()],
+    )
+    statuses: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
+    notes: dict[str, None] = {}
+    device_name: list[str] = []
+
+    def done(report: FrameReport | None) -> None:
+        if report is not None:
+            statuses[report.status] += 1
+            counts.update(report.counts)
+            notes.update(dict.fromkeys(report.notes))
+            on_frame(report)
+
+    def filters() -> Filters:
+        made = compile_filters(params, config, device=device, pipeline=pipeline)
+        device_name.append(made.device)
+        return made
+
+    with _nothing_half_written(plan), checkpoint.lock(plan.out):
+        start = begin(plan, resume=resume, overwrite=overwrite)
+        end = len(plan.files)
+        if start is not None:
+            read = partial(_read, source)
+            write = partial(_write, source, plan, options, provenance)
+            loaded = read_ahead(read, range(start.next_index, end), threads=threads)
+            with write_behind(done, threads=threads) as submit, contextlib.closing(loaded):
+                end = _filter(plan, start, loaded, filters, write, submit, stop, checkpoint_every)
+        if start is not None and end == len(plan.files):
+            if plan.video is not None:
+                preview.write_video(plan.video, _pictures(plan, options.exposure), fps=fps)
+            checkpoint.save_run(plan.out, plan.identity, complete=True)
+            checkpoint.remove_checkpoint(plan.out)
+    return Summary(
+        out=plan.out,
+        frames=len(plan.files),
+        resumed_at=len(plan.files) if start is None else start.next_index,
+        statuses=dict(statuses),
+        counts=dict(counts),
+        notes=tuple(notes),
+        interrupted=end < len(plan.files),
+        device="".join(device_name),
+        video=plan.video if end == len(plan.files) else None,
+        seconds=time.monotonic() - began,
+    )
+
+
+def _filter(
+    plan: Plan,
+    start: Checkpoint,
+    loaded: Iterator[frames.LoadedFrame | None],
+    make_filters: Callable[[], Filters],
+    write: Callable[[int, frames.LoadedFrame, Output], FrameReport],
+    submit: Submit,
+    stop: Callable[[], bool],
+    checkpoint_every: int,
+) -> int:
+    """Filter frame after frame, leaving the writing to `submit`; how many of the sequence's frames are done then."""
+    history, filters = start.history, None
+
+    def save(index: int) -> None:
+        submit(partial(checkpoint.save_checkpoint, plan.out, plan.identity, Checkpoint(index, history)), after_all=True)
+
+    for index in range(start.next_index, len(plan.files)):
+        try:
+            item = next(loaded)
+            if item is not None:
+                _check_size(item, history)
+        except SvgfError:
+            if index > start.next_index:
+                save(index)
+            raise
+        if item is None:
+            if plan.outputs[index] is None:
+                history = None
+            submit(partial(_fill_gap, plan, index), after_all=True)
+        else:
+            filters = filters or make_filters()
+            # The history is not donated: a checkpoint in the background may still be reading it.
+            history, output = filters.step(filters.init(item.frame) if history is None else history, item.frame)
+            submit(partial(write, index, item, output))
+        if stop() and index + 1 < len(plan.files):
+            save(index + 1)
+            return index + 1
+        at_end = index + 1 == len(plan.files)
+        if plan.video is not None if at_end else (index + 1) % checkpoint_every == 0:
+            save(index + 1)  # at the end only for the sake of the video, which could be interrupted too
+    return len(plan.files)
+
+
+def _identity(source: frames.Source, options: WriteOptions, provenance: Mapping[str, str]) -> checkpoint.Identity:
+    """Whatever the outputs depend on, but for the parameters and the input frames."""
+    return {
+        "version": __version__,
+        "attributes": {name: provenance[name] for name in ("svgf_jax:preset", "svgf_jax:source")},
+        "options": options._asdict(),
+        "roles": {role: list(layer.channels) for role, layer in source.roles.layers.items()},
+        "cameras": None if source.cameras is None else stamp(source.cameras.path),
+        "missing": source.sequence.missing,
+    }
+
+
+def _read(source: frames.Source, index: int) -> frames.LoadedFrame | None:
+    return None if source.sequence.files[index][1] is None else frames.read_frame(source, index)
+
+
+def _check_size(item: frames.LoadedFrame, history: History | None) -> None:
+    """A history holds only for frames of its own size and signals."""
+    if history is None:
+        return
+    then, now = history.illumination.shape, item.frame.radiance.shape
+    if then != now:
+        raise SvgfError(
+            f"{item.path}: this frame is {now[2]} x {now[1]} pixels with {now[0]} signals, the one before it {then[2]} "
+            f"x {then[1]} with {then[0]}; wanted one size throughout. Denoise each part as a sequence (--frames)."
+        )
+
+
+def _write(
+    source: frames.Source,
+    plan: Plan,
+    options: WriteOptions,
+    provenance: Mapping[str, str],
+    index: int,
+    item: frames.LoadedFrame,
+    output: Output,
+) -> FrameReport:
+    """Bring one frame's output to the host and onto the disk. Runs in a background thread."""
+    path = plan.outputs[index]
+    assert path is not None
+    output = to_host(output, item.path)
+    image, clipped = outputs.compose(
+        output, item.image, options=options, signals=source.roles.signals, attributes=provenance
+    )
+    notes = list(item.notes)
+    if dropped := outputs.write_frame(path, image, options=options):
+        notes.append(f"header attributes that could not be passed through: {', '.join(dropped)}")
+    if (np.asarray(item.frame.object_id) == -1).all():
+        notes.append("a frame without any surface: it passed through unfiltered")
+    rejected = {name: int(count) for name, count in output.rejected._asdict().items()}
+    counts = Counter(item.counts) + Counter(rejected) + Counter(clipped=clipped)
+    return FrameReport(plan.files[index][0], "filtered", path, dict(counts), tuple(notes))
+
+
+def _fill_gap(plan: Plan, index: int) -> FrameReport:
+    """Stand in for a missing frame: the output before it again, or nothing. Runs once that output is complete."""
+    number, path = plan.files[index][0], plan.outputs[index]
+    if path is None:
+        return FrameReport(number, "skipped", None, {}, ())
+    before = plan.outputs[index - 1]
+    assert before is not None  # the first frame of a plan that holds is there
+    for suffix in (".exr", ".png") if plan.png else (".exr",):
+        preview.copy_file(before.with_suffix(suffix), path.with_suffix(suffix))
+    return FrameReport(number, "held", path, {}, ())
+
+
+def _pictures(plan: Plan, exposure: float) -> Iterator[np.ndarray]:
+    """The outputs as 8-bit pictures, read back one at a time."""
+    for path in plan.outputs:
+        if path is not None:
+            yield preview.tonemap(outputs.beauty(exr.read(path)), exposure=exposure)
+
+
+@contextlib.contextmanager
+def _nothing_half_written(plan: Plan) -> Iterator[None]:
+    """Where a run fails before its first output, leave no trace of it."""
+    new_out, new_state = not plan.out.exists(), not (plan.out / checkpoint.FOLDER).exists()
+    state = plan.out / checkpoint.FOLDER
+    try:
+        yield
+    except BaseException:
+        if new_state and not ((state / "run.json").exists() and any(path.exists() for path in written(plan))):
+            shutil.rmtree(state, ignore_errors=True)
+        if new_out:
+            with contextlib.suppress(OSError):  # not empty
+                plan.out.rmdir()
+        raise
