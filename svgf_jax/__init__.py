@@ -7,18 +7,41 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from svgf_jax.accumulation import accumulate as accumulate
+    from svgf_jax.atrous import atrous_filter as atrous_filter
+    from svgf_jax.atrous import atrous_level as atrous_level
+    from svgf_jax.color import demodulate as demodulate
+    from svgf_jax.color import luminance as luminance
+    from svgf_jax.color import remodulate as remodulate
+    from svgf_jax.color import tonemap as tonemap
+    from svgf_jax.edges import edge_weight as edge_weight
+    from svgf_jax.pipeline import denoise as denoise
+    from svgf_jax.pipeline import init as init
+    from svgf_jax.pipeline import step as step
+    from svgf_jax.reprojection import reproject as reproject
+    from svgf_jax.sanitation import sanitise as sanitise
     from svgf_jax.types import Config as Config
     from svgf_jax.types import Frame as Frame
     from svgf_jax.types import History as History
     from svgf_jax.types import Output as Output
     from svgf_jax.types import Params as Params
     from svgf_jax.types import Rejected as Rejected
+    from svgf_jax.types import Reprojected as Reprojected
     from svgf_jax.types import SvgfError as SvgfError
+    from svgf_jax.variance import estimate_variance as estimate_variance
 
 __version__ = "0.1.0"
 
 _HOME = {
-    "types": ["Config", "Frame", "History", "Output", "Params", "Rejected", "SvgfError"],
+    "accumulation": ["accumulate"],
+    "atrous": ["atrous_filter", "atrous_level"],
+    "color": ["demodulate", "luminance", "remodulate", "tonemap"],
+    "edges": ["edge_weight"],
+    "pipeline": ["denoise", "init", "step"],
+    "reprojection": ["reproject"],
+    "sanitation": ["sanitise"],
+    "types": ["Config", "Frame", "History", "Output", "Params", "Rejected", "Reprojected", "SvgfError"],
+    "variance": ["estimate_variance"],
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
@@ -27,7 +50,9 @@ __all__ = sorted(_MODULE_OF)  # pyright: ignore[reportUnsupportedDunderAll]
 
 def __getattr__(name: str):
     if name in _MODULE_OF:
-        return getattr(import_module(f"svgf_jax.{_MODULE_OF[name]}"), name)
+        value = getattr(import_module(f"svgf_jax.{_MODULE_OF[name]}"), name)
+        globals()[name] = value
+        return value
     raise AttributeError(f"module 'svgf_jax' has no attribute {name!r}")
 
 

@@ -64,6 +64,22 @@ class History(NamedTuple):
     object_id: Array
 
 
+class Reprojected(NamedTuple):
+    """History brought to this frame's pixels; 0 where there is none.
+
+    Attributes:
+        illumination: `[S, H, W, 3]`.
+        moments: `[S, H, W, 2]`.
+        history_length: `[H, W]`, a real number.
+        valid: `[H, W]` bool, whether there is history.
+    """
+
+    illumination: Array
+    moments: Array
+    history_length: Array
+    valid: Array
+
+
 class Rejected(NamedTuple):
     """How many pixels of a frame had to be repaired before filtering (int32 scalars).
 
@@ -154,3 +170,8 @@ class Config(NamedTuple):
 
     levels: int = 5
     feedback_level: int = 0
+
+
+def at_level(params: Params, level: int) -> Params:
+    """The scalars that an a-trous level reads: entry `level` of per-level leaves, scalar leaves as they are."""
+    return Params(*(leaf[level] if getattr(leaf, "ndim", 0) == 1 else leaf for leaf in params))

@@ -1,0 +1,50 @@
+"""Checks of shapes and dtypes at the public boundary: they cost nothing at run time, and name what does not fit."""
+
+import jax.numpy as jnp
+
+from svgf_jax.types import Config, Frame, Params, SvgfError
+
+
+def check_frame(frame: Frame) -> None:
+    """Raise `SvgfError` unless the arrays of one frame fit together."""
+    if len(frame.radiance.shape) != 4 or frame.radiance.shape[-1] != 3:
+        raise SvgfError(
+            f"radiance has shape {frame.radiance.shape}; wanted [S, H, W, 3], S signals. "
+            "For a plain image add the first axis: radiance[None]. For a sequence call denoise, not step."
+        )
+    signals, height, width, _ = frame.radiance.shape
+    shapes = {
+        "emission": (height, width, 3),
+        "normal": (height, width, 3),
+        "depth": (height, width),
+        "prev_depth": (height, width),
+        "motion": (height, width, 2),
+        "object_id": (height, width),
+    }
+    for name, wanted in shapes.items():
+        got = tuple(getattr(frame, name).shape)
+        if got != wanted:
+            raise SvgfError(f"{name} has shape {got}; wanted {wanted}, to go with radiance {frame.radiance.shape}")
+    if tuple(frame.albedo.shape) not in {(signals, height, width, 3), (1, height, width, 3)}:
+        raise SvgfError(
+            f"albedo has shape {frame.albedo.shape}; wanted {(signals, height, width, 3)}, "
+            f"or {(1, height, width, 3)} if all signals share it"
+        )
+    dtype = frame.radiance.dtype
+    if dtype not in (jnp.float32, jnp.float64):
+        raise SvgfError(f"radiance is {dtype}; wanted float32 or float64. Try radiance.astype('float32')")
+    for name in Frame._fields:
+        wanted_dtype = jnp.int32 if name == "object_id" else dtype
+        if getattr(frame, name).dtype != wanted_dtype:
+            raise SvgfError(f"{name} is {getattr(frame, name).dtype}; wanted {jnp.dtype(wanted_dtype)}, like the rest of the frame")
+
+
+def check_params(params: Params, config: Config, *, dtype) -> Params:
+    """The parameters as arrays of `dtype`; raise `SvgfError` unless each is a scalar or has one value per level."""
+    arrays = Params(*(jnp.asarray(leaf, dtype) for leaf in params))
+    for name, leaf in arrays._asdict().items():
+        if leaf.ndim != 0 and leaf.shape != (max(config.levels, 1),):
+            raise SvgfError(
+                f"{name} has shape {leaf.shape}; wanted a scalar, or one value for each of the {config.levels} levels"
+            )
+    return arrays

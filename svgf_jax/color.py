@@ -1,0 +1,44 @@
+"""Colour arithmetic: luminance, demodulation by albedo, tone mapping."""
+
+import jax.numpy as jnp
+from jax import Array
+
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709, linear
+
+
+def luminance(color: Array) -> Array:
+    """Rec. 709 luminance of linear RGB: `[..., 3]` -> `[...]`."""
+    return luminance_of_planes(color[..., 0], color[..., 1], color[..., 2])
+
+
+def luminance_of_planes(red: Array, green: Array, blue: Array) -> Array:
+    """Rec. 709 luminance of three planes of one shape."""
+    return LUMINANCE[0] * red + LUMINANCE[1] * green + LUMINANCE[2] * blue
+
+
+def demodulate(radiance: Array, albedo: Array, *, albedo_floor: Array | float = 1e-3) -> Array:
+    """Illumination: radiance / max(albedo, albedo_floor), per signal and channel.
+
+    The result is kept below the largest float / 2**12, so that sums of it stay finite.
+
+    Args:
+        radiance: `[S, H, W, 3]`, finite, >= 0.
+        albedo: `[S or 1, H, W, 3]`, finite.
+        albedo_floor: > 0.
+
+    Returns:
+        `[S, H, W, 3]`.
+    """
+    illumination = radiance / jnp.maximum(albedo, albedo_floor)
+    return jnp.minimum(illumination, float(jnp.finfo(radiance.dtype).max) / 2**12)
+
+
+def remodulate(illumination: Array, albedo: Array, *, albedo_floor: Array | float = 1e-3) -> Array:
+    """The inverse of `demodulate`, with the same floor, so that an identity filter is lossless. Shapes as there."""
+    return illumination * jnp.maximum(albedo, albedo_floor)
+
+
+def tonemap(color: Array) -> Array:
+    """Reinhard's x / (1 + x) per channel, negatives as 0: linear `[...]` -> [0, 1)."""
+    positive = jnp.maximum(color, 0.0)
+    return positive / (1.0 + positive)

@@ -1,0 +1,104 @@
+"""The filter, step by step as in figure 1 of Schied et al. 2017: (history, frame) -> (history, output)."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from svgf_jax.accumulation import accumulate
+from svgf_jax.atrous import atrous_filter
+from svgf_jax.check import check_frame, check_params
+from svgf_jax.color import demodulate, remodulate
+from svgf_jax.reprojection import reproject
+from svgf_jax.sanitation import sanitise
+from svgf_jax.types import Config, Frame, History, Output, Params, at_level
+from svgf_jax.variance import estimate_variance
+
+
+def init(frame: Frame) -> History:
+    """The empty history that a sequence starts with. Only the shapes and the dtype of `frame` matter."""
+    signals, height, width, _ = frame.radiance.shape
+    dtype = frame.radiance.dtype
+    return History(
+        illumination=jnp.zeros((signals, height, width, 3), dtype),
+        moments=jnp.zeros((signals, height, width, 2), dtype),
+        history_length=jnp.zeros((height, width), dtype),
+        depth=jnp.zeros((height, width), dtype),
+        normal=jnp.zeros((height, width, 3), dtype),
+        object_id=jnp.full((height, width), -1, jnp.int32),
+    )
+
+
+@partial(jax.jit, static_argnames="config")
+def step(
+    history: History, frame: Frame, *, params: Params = Params(), config: Config = Config()
+) -> tuple[History, Output]:
+    """Filter one frame.
+
+    Args:
+        history: of the frame before; `init(frame)` at the start or after a cut.
+        frame: one frame, float32 or float64 throughout; shapes and units as in `Frame`. Bad pixels are repaired and counted.
+        params: the filter's numbers, traced: scalars or one value per a-trous level.
+        config: the filter's static choices.
+
+    Returns:
+        The history for the next frame, and this frame's output.
+
+    Raises:
+        SvgfError: shapes or dtypes that do not fit together.
+    """
+    check_frame(frame)
+    params = check_params(params, config, dtype=frame.radiance.dtype)
+    floor = at_level(params, 0).albedo_floor
+
+    frame, rejected = sanitise(frame)
+    surface = frame.object_id != -1
+    illumination = demodulate(frame.radiance, frame.albedo, albedo_floor=floor)
+    previous = reproject(history, frame, params=params)
+    accumulated = accumulate(illumination, previous, frame, params=params)
+    variance = estimate_variance(accumulated.moments, accumulated.history_length, frame, params=params)
+    filtered, variance_filtered, feedback = atrous_filter(
+        accumulated.illumination, variance, frame, params=params, config=config
+    )
+    reflected = remodulate(filtered, frame.albedo, albedo_floor=floor)
+    reflected = jnp.where(surface[None, :, :, None], reflected, frame.radiance)
+
+    history = History(
+        illumination=feedback,
+        moments=accumulated.moments,
+        history_length=accumulated.history_length,
+        depth=frame.depth,
+        normal=frame.normal,
+        object_id=frame.object_id,
+    )
+    return history, Output(
+        image=reflected.sum(axis=0) + frame.emission,
+        illumination=filtered,
+        variance=variance,
+        variance_filtered=variance_filtered,
+        history_length=accumulated.history_length,
+        valid=previous.valid,
+        rejected=rejected,
+    )
+
+
+@partial(jax.jit, static_argnames="config")
+def denoise(
+    frames: Frame, *, history: History | None = None, params: Params = Params(), config: Config = Config()
+) -> tuple[History, Output]:
+    """Filter a sequence: `step` in `lax.scan`, bit for bit what `step` gives frame by frame.
+
+    Args:
+        frames: a `Frame` whose arrays have a leading T.
+        history: of the frame before the first; None = start afresh.
+        params, config: as for `step`.
+
+    Returns:
+        The history after the last frame (to go on with), and the outputs with a leading T.
+    """
+    if history is None:
+        history = init(jax.tree.map(lambda a: a[0], frames))
+    # Recompute a frame in reverse mode rather than store what happened inside it.
+    body = jax.checkpoint(partial(step, params=params, config=config), prevent_cse=False)
+    return lax.scan(body, history, frames)

@@ -1,0 +1,118 @@
+"""Temporal reprojection: fetch each pixel's history from where its surface point was (Schied et al. 2017, section 4.1)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from svgf_jax.sampling import STRIP_ROWS, planes, read_at, square_offsets
+from svgf_jax.types import Frame, History, Params, Reprojected, at_level
+
+_LEAST_WEIGHT = 0.01  # of the consistent ones of the 2 x 2 taps, to be trusted
+_BILINEAR = np.array([[0, 0], [0, 1], [1, 0], [1, 1]], dtype=np.int32)
+
+
+def reproject(history: History, frame: Frame, *, params: Params, strip_rows: int | None = STRIP_ROWS) -> Reprojected:
+    """Bring the history to this frame's pixels.
+
+    A previous pixel q is consistent with p if it is inside the image, has the same object id, a depth within reproject_depth of
+    prev_depth(p), and a normal within reproject_normal. P = p + motion(p); the history is the bilinear mean of the consistent ones
+    of the 2 x 2 taps around P, if their weights sum to 0.01 or more; else the plain mean of the consistent ones of the 3 x 3 around
+    the pixel nearest to P; else there is none. Every tap is judged by itself, so P may lie outside the image.
+
+    Args:
+        history: of the previous frame.
+        frame: sanitised.
+        params: per-level leaves are read at entry 0.
+        strip_rows: rows handled at a time (the fallback runs only in strips that need it); None = all at once.
+    """
+    scalars = at_level(params, 0)
+    height, width = frame.depth.shape
+    rows = height if strip_rows is None else -(-height // -(-height // strip_rows))
+    count = -(-height // rows)
+    guides = {"id": history.object_id, "depth": history.depth, "normal": planes(history.normal)}
+    values = (tuple(map(planes, history.illumination)), tuple(map(planes, history.moments)), history.history_length)
+    current = {
+        "id": frame.object_id,
+        "depth": frame.prev_depth,
+        "normal": planes(frame.normal),
+        "motion": planes(frame.motion),
+    }
+    # Rows below the image read object id 0, whose history is thrown away again.
+    padded = jax.tree.map(lambda a: jnp.pad(a, ((0, count * rows - height), (0, 0))), current)
+
+    def consistent(p, row: Array, column: Array) -> Array:
+        read = lambda plane: read_at(plane, row, column)[0]  # noqa: E731
+        q_id, inside = read_at(guides["id"], row, column)
+        near = jnp.abs(read(guides["depth"]) - p["depth"]) <= scalars.reproject_depth * jnp.maximum(p["depth"], 1e-6)
+        n = [a * read(b) for a, b in zip(p["normal"], guides["normal"], strict=True)]
+        return inside & (p["id"] != -1) & (q_id == p["id"]) & near & (n[0] + n[1] + n[2] >= scalars.reproject_normal)
+
+    def mean_over(base_row: Array, base_column: Array, offsets: np.ndarray, weigh) -> tuple[Array, tuple]:
+        """Weights and weighted sums of the history's values over the taps base + offsets."""
+        taps = jnp.asarray(offsets)
+        weights = lax.map(lambda o: weigh(base_row + o[0], base_column + o[1], o), taps)
+
+        def add(sums, tap):
+            offset, weight = tap
+            return jax.tree.map(
+                lambda s, v: s + weight * read_at(v, base_row + offset[0], base_column + offset[1])[0], sums, values
+            ), None
+
+        zeros = jax.tree.map(lambda _: jnp.zeros((rows, width), frame.depth.dtype), values)
+        sums, _ = lax.scan(add, zeros, (taps, weights))
+        return weights.sum(axis=0), sums
+
+    def strip(first_row: Array):
+        p = jax.tree.map(lambda a: lax.dynamic_slice(a, (first_row, jnp.zeros_like(first_row)), (rows, width)), padded)
+        x, y = (_position(p["motion"][axis], first_row, axis, (width, height)[axis]) for axis in (0, 1))
+
+        floor_x, floor_y = jnp.floor(x), jnp.floor(y)
+        fraction_x, fraction_y = x - floor_x, y - floor_y
+
+        def bilinear(row: Array, column: Array, offset: Array) -> Array:
+            weight_y = jnp.where(offset[0] == 1, fraction_y, 1.0 - fraction_y)
+            weight_x = jnp.where(offset[1] == 1, fraction_x, 1.0 - fraction_x)
+            return jnp.where(consistent(p, row, column), weight_y * weight_x, 0.0)
+
+        weight, sums = mean_over(floor_y.astype(jnp.int32), floor_x.astype(jnp.int32), _BILINEAR, bilinear)
+        found = weight >= _LEAST_WEIGHT
+        missing = ~found & (p["id"] != -1)
+
+        def fall_back():
+            nearest = (jnp.floor(y + 0.5).astype(jnp.int32), jnp.floor(x + 0.5).astype(jnp.int32))
+
+            def plain(row: Array, column: Array, offset: Array) -> Array:
+                return consistent(p, row, column).astype(x.dtype)
+
+            weight, sums = mean_over(*nearest, square_offsets(1), plain)
+            return weight, sums
+
+        def nothing():
+            return jax.tree.map(jnp.zeros_like, (weight, sums))
+
+        around, around_sums = lax.cond(jnp.any(missing), fall_back, nothing)
+        found_around = missing & (around > 0.0)
+        divisor = jnp.where(found, weight, jnp.where(found_around, around, 1.0))
+        means = jax.tree.map(
+            lambda near, far: jnp.where(found, near, jnp.where(found_around, far, 0.0)) / divisor, sums, around_sums
+        )
+        return means, found | found_around
+
+    strip = jax.checkpoint(strip, prevent_cse=False)  # type: ignore[assignment]
+    result = lax.map(strip, jnp.arange(count, dtype=jnp.int32) * rows)
+    (illumination, moments, length), valid = jax.tree.map(lambda a: a.reshape(count * rows, width)[:height], result)
+    return Reprojected(
+        illumination=_stack(illumination), moments=_stack(moments), history_length=length, valid=valid
+    )
+
+
+def _position(motion: Array, first_row: Array, axis: int, extent: int) -> Array:
+    """P along one axis, in pixels; far outside the image it is as good as just outside."""
+    index = lax.broadcasted_iota(jnp.int32, motion.shape, 1 - axis)
+    start = first_row if axis == 1 else jnp.zeros_like(first_row)
+    return jnp.clip((start + index).astype(motion.dtype) + motion, -4.0, extent + 4.0)
+
+
+def _stack(signals: tuple[tuple[Array, ...], ...]) -> Array:
+    return jnp.stack([jnp.stack(signal, axis=-1) for signal in signals])

@@ -1,0 +1,129 @@
+"""Reading an image at other pixels: neighbours, taps, reprojected positions. The only file that knows the border rule.
+
+The border rule: a tap outside the image counts for nothing. Planes read 0 there, and every sum carries a plane that says
+where a surface is (`surface` of `edges.Guides`), which reads 0 outside too.
+
+Here an image is a tree of *planes* `[H, W]`, one a channel: on XLA:CPU a slice of a plane is vectorised, a slice of `[C, H, W]`
+or `[H, W, C]` is not, and costs ten times as much.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+Planes = Any  # a tree whose leaves are [H, W] arrays
+Sums = TypeVar("Sums")
+
+STRIP_ROWS = 36  # a strip's working set then stays near the size of a level-2 cache at 1920 pixels width
+
+
+def planes(image: Array) -> tuple[Array, ...]:
+    """Split `[H, W, C]` into C planes `[H, W]`."""
+    return tuple(image[..., c] for c in range(image.shape[-1]))
+
+
+def shift(plane: Array, dy: int, dx: int) -> Array:
+    """The neighbour at (+dx, +dy): `shift(a, dy, dx)[y, x] == a[y + dy, x + dx]`, 0 outside the image. `[H, W]`."""
+    height, width = plane.shape
+    if abs(dy) >= height or abs(dx) >= width:
+        return jnp.zeros_like(plane)
+    inside = plane[max(dy, 0) : height + min(dy, 0), max(dx, 0) : width + min(dx, 0)]
+    return jnp.pad(inside, ((max(-dy, 0), max(dy, 0)), (max(-dx, 0), max(dx, 0))))
+
+
+def square_offsets(radius: int, step_size: int = 1) -> np.ndarray:
+    """The taps (dy, dx) of a square window, `[(2 radius + 1)**2, 2]` int32, in pixels."""
+    reach = np.arange(-radius, radius + 1, dtype=np.int32) * step_size
+    return np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def sum_over_taps(
+    tap: Callable[[Sums, Any, Any, Any], Sums],
+    finish: Callable[[Sums, Any], Planes],
+    *,
+    neighbours: Planes,
+    centre: Planes,
+    offsets: np.ndarray,
+    per_tap: Any = (),
+    sums: Sums,
+    where: Array | None = None,
+    strip_rows: int | None = STRIP_ROWS,
+) -> Planes:
+    """Run a stencil: for every pixel p, add up what `tap` makes of each neighbour q, then `finish` the sums.
+
+    The taps are a loop that carries the sums (XLA:CPU would recompute a shared weight once per sum otherwise), inside a loop over
+    strips of rows that fit the cache; reverse mode recomputes a strip rather than storing its taps.
+
+    Args:
+        tap: `tap(sums, q, p, t) -> sums`; q are `neighbours` read at p + offset, p are `centre` at p, t is `per_tap` of this tap.
+        finish: `finish(sums, p)` -> a tree of planes, the result.
+        neighbours: planes `[H, W]` read at the taps, 0 outside the image.
+        centre: planes `[H, W]` read at the pixel itself.
+        offsets: `[n, 2]` integers (dy, dx), pixels.
+        per_tap: tree of `[n, ...]` arrays, one entry a tap.
+        sums: tree of scalars, the sums' start (usually zeros).
+        where: `[H, W]` bool; a strip without a True is not computed and its result is 0. None = everywhere.
+        strip_rows: rows per strip; None = no strips and no loop, the plain form that the other is tested against.
+
+    Returns:
+        The tree that `finish` returns, with leaves `[H, W]`.
+    """
+    height, width = jax.tree.leaves(centre)[0].shape
+    top, left = (int(r) for r in np.abs(offsets).max(axis=0))
+
+    if strip_rows is None:
+        totals = jax.tree.map(lambda s: jnp.full((height, width), s), sums)
+        for i, (dy, dx) in enumerate(offsets):
+            q = jax.tree.map(lambda a, dy=int(dy), dx=int(dx): shift(a, dy, dx), neighbours)
+            totals = tap(totals, q, centre, jax.tree.map(lambda a, i=i: a[i], per_tap))
+        return finish(totals, centre)
+
+    count = -(-height // strip_rows)
+    rows = -(-height // count)
+    below = count * rows - height
+    padded = jax.tree.map(lambda a: jnp.pad(a, ((top, top + below), (left, left))), neighbours)
+    centred = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), (centre, where))
+    corners = jnp.asarray(offsets + np.array([top, left], dtype=np.int32))
+
+    def compute(window: Planes, p: Planes) -> Planes:
+        def body(totals: Sums, at: Any) -> tuple[Sums, None]:
+            (corner, t) = at
+            q = jax.tree.map(lambda a: lax.dynamic_slice(a, (corner[0], corner[1]), (rows, width)), window)
+            return tap(totals, q, p, t), None
+
+        totals, _ = lax.scan(body, jax.tree.map(lambda s: jnp.full((rows, width), s), sums), (corners, per_tap))
+        return finish(totals, p)
+
+    def strip(first_row: Array) -> Planes:
+        zero = jnp.zeros_like(first_row)
+        window = jax.tree.map(lambda a: lax.dynamic_slice(a, (first_row, zero), (rows + 2 * top, width + 2 * left)), padded)
+        p, wanted = jax.tree.map(lambda a: lax.dynamic_slice(a, (first_row, zero), (rows, width)), centred)
+        if wanted is None:
+            return compute(window, p)
+        shape = jax.eval_shape(compute, window, p)
+        nothing = lambda *_: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shape)  # noqa: E731
+        return lax.cond(jnp.any(wanted), compute, nothing, window, p)
+
+    strip = jax.checkpoint(strip, prevent_cse=False)  # type: ignore[assignment]
+    result = lax.map(strip, jnp.arange(count, dtype=jnp.int32) * rows)
+    return jax.tree.map(lambda a: a.reshape(count * rows, width)[:height], result)
+
+
+def read_at(plane: Array, row: Array, column: Array) -> tuple[Array, Array]:
+    """Read a plane at integer positions.
+
+    Args:
+        plane: `[H, W]`.
+        row, column: integer arrays of one shape; may lie outside.
+
+    Returns:
+        The values (of the nearest pixel inside, where outside) and a bool array: inside the image.
+    """
+    height, width = plane.shape
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    index = jnp.clip(row, 0, height - 1) * width + jnp.clip(column, 0, width - 1)
+    return plane.reshape(-1).at[index].get(mode="promise_in_bounds"), inside

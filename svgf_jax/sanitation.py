@@ -1,0 +1,56 @@
+"""Repair what a renderer should not have written, before it can enter the history, and count it."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from svgf_jax.types import Frame, Rejected
+
+_NOWHERE = 1e9  # a motion that points outside every image: no history
+
+
+def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
+    """Make every number of a frame finite.
+
+    Radiance: non-finite or negative components become 0. Emission: non-finite ones become 0, negative ones stay. A non-finite
+    normal, depth or albedo: no surface. A non-finite motion or prev_depth: no history. Guides read 0 where there is no surface,
+    the albedo 1.
+
+    Args:
+        frame: one frame; shapes as in `Frame`.
+
+    Returns:
+        The repaired frame and the counts of repaired pixels.
+    """
+    radiance_finite, emission_finite = jnp.isfinite(frame.radiance), jnp.isfinite(frame.emission)
+    radiance_positive = ~(frame.radiance < 0.0)
+    was_surface = frame.object_id != -1
+    guided = (
+        jnp.isfinite(frame.normal).all(axis=-1)
+        & jnp.isfinite(frame.depth)
+        & jnp.isfinite(frame.albedo).all(axis=(0, 3))
+    )
+    traced = jnp.isfinite(frame.motion).all(axis=-1) & jnp.isfinite(frame.prev_depth)
+    surface = was_surface & guided
+
+    repaired = Frame(
+        radiance=jnp.where(radiance_finite & radiance_positive, frame.radiance, 0.0),
+        albedo=jnp.where(surface[None, :, :, None], frame.albedo, 1.0),
+        emission=jnp.where(emission_finite, frame.emission, 0.0),
+        normal=jnp.where(surface[..., None], frame.normal, 0.0),
+        depth=jnp.where(surface, frame.depth, 0.0),
+        prev_depth=jnp.where(surface & traced, frame.prev_depth, 0.0),
+        motion=jnp.where((surface & traced)[..., None], frame.motion, _NOWHERE),
+        object_id=jnp.where(surface, frame.object_id, -1),
+    )
+    rejected = Rejected(
+        radiance=_count(~radiance_finite.all(axis=(0, 3))),
+        negative=_count(~radiance_positive.all(axis=(0, 3))),
+        emission=_count(~emission_finite.all(axis=-1)),
+        surface=_count(was_surface & ~guided),
+        motion=_count(surface & ~traced),
+    )
+    return repaired, rejected
+
+
+def _count(pixels: Array) -> Array:
+    return pixels.sum(dtype=jnp.int32)

@@ -1,0 +1,93 @@
+"""Luminance variance: from the accumulated moments, or from the neighbourhood while history is short (Schied et al. 2017, 4.2)."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from svgf_jax.edges import depth_gradient, geometry_exponent, guides_of
+from svgf_jax.sampling import STRIP_ROWS, planes, square_offsets, sum_over_taps
+from svgf_jax.types import Frame, Params, at_level
+
+SHORT_HISTORY = 4 - 1e-3  # history length is a real number: a mean of threes and fives must not be decided by rounding
+_RADIUS = 3
+
+
+def estimate_variance(
+    moments: Array, history_length: Array, frame: Frame, *, params: Params, strip_rows: int | None = STRIP_ROWS
+) -> Array:
+    """V = max(0, M2 - M1^2), temporal where history is long enough, else over 7 x 7 pixels.
+
+    The spatial estimate is the mean of the moments over the window with the weights w_z w_n, and is multiplied by
+    max(1, short_history_boost / h). Strips of the image in which no pixel needs it are skipped.
+
+    Args:
+        moments: `[S, H, W, 2]`, accumulated M1 and M2 of the luminance.
+        history_length: `[H, W]`, h.
+        frame: sanitised; its normal, depth and object_id guide the estimate.
+        params: per-level leaves are read at entry 0.
+        strip_rows: how `sampling.sum_over_taps` blocks the work; None = the plain form.
+
+    Returns:
+        `[S, H, W]`, >= 0; 0 where there is no surface.
+    """
+    scalars = at_level(params, 0)
+    guides = guides_of(frame)
+    short = (history_length < SHORT_HISTORY) & (frame.object_id != -1)
+    slope = depth_gradient(frame.depth, frame.object_id)
+    signals = tuple(planes(signal) for signal in moments)
+    offsets = square_offsets(_RADIUS)
+    steps = offsets.astype(frame.depth.dtype)
+
+    def tap(sums, q, p, t):
+        distance_y, distance_x = t
+        exponent = geometry_exponent(
+            p["guides"],
+            q["guides"],
+            p["slope"][0] * distance_x + p["slope"][1] * distance_y,
+            sigma_depth=scalars.sigma_depth,
+            sigma_normal=scalars.sigma_normal,
+            depth_epsilon=scalars.depth_epsilon,
+        )
+        weight = q["guides"].surface * jnp.exp(exponent)
+        weights, totals = sums
+        totals = tuple(
+            (m1 + weight * q1, m2 + weight * q2) for (m1, m2), (q1, q2) in zip(totals, q["moments"], strict=True)
+        )
+        return weights + weight, totals
+
+    def finish(sums, p):
+        weights, totals = sums
+        any_weight = weights > 1e-15
+        divisor = jnp.where(any_weight, weights, 1.0)
+        return tuple(
+            _variance(
+                jnp.where(any_weight, m1 / divisor, own1),
+                jnp.where(any_weight, m2 / divisor, own2),
+            )
+            for (m1, m2), (own1, own2) in zip(totals, p["moments"], strict=True)
+        )
+
+    zero = jnp.zeros((), moments.dtype)
+    neighbours = {"guides": guides, "moments": signals}
+    spatial = sum_over_taps(
+        tap,
+        finish,
+        neighbours=neighbours,
+        centre={**neighbours, "slope": slope},
+        offsets=offsets,
+        per_tap=(jnp.asarray(steps[:, 0]), jnp.asarray(steps[:, 1])),
+        sums=(zero, tuple((zero, zero) for _ in signals)),
+        where=short,
+        strip_rows=strip_rows,
+    )
+    boost = jnp.maximum(1.0, scalars.short_history_boost / jnp.maximum(history_length, 1.0))
+    variance = jnp.stack(
+        [
+            jnp.where(short, around * boost, _variance(m1, m2))
+            for around, (m1, m2) in zip(spatial, signals, strict=True)
+        ]
+    )
+    return jnp.where((frame.object_id != -1)[None], variance, 0.0)
+
+
+def _variance(first: Array, second: Array) -> Array:
+    return jnp.maximum(0.0, second - first * first)
