@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from svgf_jax.exr_layout import PathName
 from svgf_jax.metrics import Scores, score
 from svgf_jax.references import NAMES, read_radiance
 from svgf_jax.sequences import find_sequence, format_range
@@ -12,8 +13,8 @@ from svgf_jax.types import SvgfError
 
 
 def compare_sequences(
-    out: str,
-    reference: str,
+    out: PathName,
+    reference: PathName,
     *,
     frames: str | None = None,
     with_flip: bool = False,

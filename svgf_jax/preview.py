@@ -34,7 +34,7 @@ def side_by_side(panels: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
     if len({picture.shape[0] for _, picture in panels}) != 1:
         shapes = [picture.shape for _, picture in panels]
         raise SvgfError(f"Cannot set pictures of shapes {shapes} side by side: wanted at least one, all of one height.")
-    size = max(11, panels[0][1].shape[0] // 16)
+    size = max(11, panels[0][1].shape[0] // 18)
     strip, gap = round(1.7 * size), 2
     width = sum(picture.shape[1] for _, picture in panels) + gap * (len(panels) - 1)
     canvas = Image.new("RGB", (width, panels[0][1].shape[0] + strip), (24, 24, 24))

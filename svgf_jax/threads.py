@@ -1,7 +1,7 @@
 """Reading ahead and writing behind: two small bounded queues over thread pools."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from typing import Any, Protocol, TypeVar
@@ -10,7 +10,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def read_ahead(read: Callable[[Item], Result], items: Iterable[Item], *, threads: int) -> Iterator[Result]:
+def read_ahead(read: Callable[[Item], Result], items: Iterable[Item], *, threads: int) -> Generator[Result, None, None]:
     """`map(read, items)`, in order, with up to `threads` of them read before they are asked for.
 
     At most `threads + 1` results exist at a time. What `read` raises comes out where its result would have. Closing the

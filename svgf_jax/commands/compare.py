@@ -1,0 +1,112 @@
+"""`svgf-jax compare`."""
+
+import csv
+import io
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from svgf_jax.commands import terminal
+from svgf_jax.types import SvgfError
+
+if TYPE_CHECKING:
+    from svgf_jax.metrics import Scores
+
+COLUMNS = {
+    "psnr": ("PSNR dB", "{:.2f}"),
+    "relmse": ("relMSE", "{:.4g}"),
+    "ssim": ("SSIM", "{:.4f}"),
+    "temporal": ("temporal error", "{:.4f}"),
+    "flip": ("HDR-FLIP", "{:.4f}"),
+}
+Flag = Parameter(negative=(), show_default=False)
+
+
+def compare(
+    out: Annotated[str, Parameter(name="OUT")],
+    reference: Annotated[str, Parameter(name="REF")],
+    /,
+    *,
+    frames: Annotated[str | None, Parameter(metavar="RANGE")] = None,
+    flip: Annotated[bool, Flag] = False,
+    json_file: Annotated[Path | None, Parameter(name="--json", metavar="FILE")] = None,
+    csv_file: Annotated[Path | None, Parameter(name="--csv", metavar="FILE")] = None,
+    overwrite: Annotated[bool, Flag] = False,
+) -> None:
+    """Measure a sequence against its reference, frame by frame and as a whole.
+
+    PSNR and SSIM are on x / (1 + x); relMSE is (x - r)^2 / (r^2 + 0.01); the temporal error is the RMSE of what changes
+    from frame to frame other than in the reference, on x / (1 + x). The colour is R, G, B where a file has them, else
+    the sum of direct, indirect and emission.
+
+    Args:
+        out: The sequence to measure: a folder, a pattern or a file.
+        reference: Its reference; frames are paired by number.
+        frames: Only these: 1-100, 1-100x2 or 1,3,5-9.
+        flip: HDR-FLIP too (slow; needs the extra `flip`).
+        json_file: Write the scores to this file as JSON.
+        csv_file: Write the scores to this file as CSV.
+        overwrite: Replace the files of --json and --csv if they exist.
+    """
+    from svgf_jax import metrics
+    from svgf_jax.comparison import compare_sequences
+
+    for path in (json_file, csv_file):
+        if path is not None and path.exists() and not overwrite:
+            raise SvgfError(f"{path} exists already; choose another name, or --overwrite.")
+    if flip:
+        metrics.require_flip()
+    pairs = compare_sequences(out, reference, frames=frames, with_flip=flip, warn=lambda text: terminal.warn([text]))
+    scores = {str(number): score for number, score in pairs}
+    mean = metrics.mean_scores(scores.values())
+    print_scores("frame", scores | {"mean": mean})
+    if json_file is not None:
+        rows = [{"frame": int(number), **score._asdict()} for number, score in scores.items()]
+        _save(json_file, terminal.to_json({"out": out, "reference": reference, "frames": rows, "mean": mean}) + "\n")
+    if csv_file is not None:
+        _save(csv_file, _to_csv(scores | {"mean": mean}))
+
+
+def print_scores(title: str, rows: Mapping[str, "Scores"]) -> None:
+    """A table on the standard output, the last row set apart; columns without any score are left out."""
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    names = [name for name in COLUMNS if not all(math.isnan(getattr(score, name)) for score in rows.values())]
+    table = Table(box=SIMPLE)
+    table.add_column(Text(title))
+    for name in names:
+        table.add_column(COLUMNS[name][0], justify="right")
+    for i, (label, score) in enumerate(rows.items()):
+        if i and i == len(rows) - 1:
+            table.add_section()
+        values = [getattr(score, name) for name in names]
+        cells = [
+            "" if math.isnan(value) else COLUMNS[name][1].format(value)
+            for name, value in zip(names, values, strict=True)
+        ]
+        table.add_row(Text(label), *cells)
+    Console().print(table)
+
+
+def _to_csv(rows: Mapping[str, "Scores"]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["frame", *COLUMNS])
+    for label, score in rows.items():
+        writer.writerow([label, *("" if math.isnan(value) else value for value in score)])
+    return text.getvalue()
+
+
+def _save(path: Path, text: str) -> None:
+    try:
+        path.write_text(text)
+    except OSError as error:
+        raise SvgfError(
+            f"Could not write {path}: {error.strerror or error}. Choose a folder that is writable."
+        ) from error

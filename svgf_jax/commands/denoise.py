@@ -1,0 +1,163 @@
+"""`svgf-jax denoise`."""
+
+import shlex
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Group, Parameter
+
+from svgf_jax.commands import settings, terminal
+
+if TYPE_CHECKING:
+    from svgf_jax.streaming import Summary
+
+Flag = Parameter(negative=(), show_default=False)
+Repeated = Parameter(negative=(), consume_multiple=False, show_default=False)
+Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab"]
+INPUT, FILTER, OUTPUT, RUN = (Group(name, sort_key=i) for i, name in enumerate(["Input", "Filter", "Output", "Run"]))
+
+
+def denoise(
+    input_: Annotated[str, Parameter(name="INPUT", group=INPUT)],
+    /,
+    *,
+    out: Annotated[Path, Parameter(name=["--out", "-o"], metavar="FOLDER", group=OUTPUT)],
+    frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
+    missing: Annotated[Literal["error", "hold", "reset"], Parameter(group=INPUT)] = "error",
+    channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = (),
+    file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = (),
+    cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto",
+    preset: Annotated[str | None, Parameter(metavar="NAME", group=FILTER)] = None,
+    params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=FILTER)] = None,
+    set_: Annotated[tuple[str, ...], Repeated, Parameter(name="--set", metavar="NAME=VALUE", group=FILTER)] = (),
+    device: Annotated[str | None, Parameter(metavar="DEVICE", group=FILTER)] = None,
+    float_: Annotated[bool, Flag, Parameter(name="--float", group=OUTPUT)] = False,
+    compression: Annotated[Compression, Parameter(group=OUTPUT)] = "zip",
+    only_denoised: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
+    diagnostics: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
+    png: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
+    video: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
+    fps: Annotated[float, Parameter(group=OUTPUT)] = 24.0,
+    exposure: Annotated[float, Parameter(group=OUTPUT)] = 1.0,
+    overwrite: Annotated[bool, Flag, Parameter(group=RUN)] = False,
+    resume: Annotated[bool, Flag, Parameter(group=RUN)] = False,
+    checkpoint_every: Annotated[int, Parameter(metavar="FRAMES", group=RUN)] = 8,
+    json: Annotated[bool, Flag, Parameter(group=RUN)] = False,
+    verbose: Annotated[bool, Flag, Parameter(name=["--verbose", "-v"], group=RUN)] = False,
+) -> int:
+    """Denoise a sequence of EXR files into a folder, one file a frame under the input's name.
+
+    Args:
+        input_: A folder, a pattern (frame_####.exr, frame_%04d.exr, frame_$F4.exr) or one file.
+        out: The output folder; made if it is not there.
+        frames: Only these: 1-100, 1-100x2 or 1,3,5-9.
+        missing: A missing frame is an error, repeats the output before it (hold), or starts the history anew (reset).
+        channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
+        file: The files of a role, for example normal=normal_####.exr. Repeatable.
+        cameras: The cameras.json of the sequence; auto takes the one beside the frames, none ignores it.
+        preset: A preset by name; `svgf-jax params list` shows them.
+        params: Parameters from a TOML file; `svgf-jax params show` prints one.
+        set_: One parameter, or one value per a-trous level: sigma_normal=64, sigma_luminance=4,3,2,1,1. Repeatable.
+        device: cpu, gpu, gpu:1, ...; what JAX chooses if not given.
+        float_: Write 32-bit float instead of 16-bit.
+        compression: EXR compression of the output.
+        only_denoised: Leave out the input's other layers and header attributes.
+        diagnostics: Add the layers svgf.variance.*, svgf.history_length and svgf.valid.
+        png: Also write a tone-mapped PNG of each frame.
+        video: Also write an MP4 of the whole (needs the extra `video`).
+        fps: Frames per second of the video.
+        exposure: Brightness factor of PNG and video.
+        overwrite: Replace outputs that exist.
+        resume: Continue an interrupted run where its last checkpoint is; the result is the same bit for bit.
+        checkpoint_every: Save the history for --resume after so many frames.
+        json: Print a summary as JSON to the standard output; all else goes to the standard error.
+        verbose: Also tell which channel plays which role, the parameters and the device.
+    """
+    chosen_preset, chosen, config = settings.choose(preset, params, set_)
+    roles = settings.assignments(channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
+    files = settings.assignments(file, option="--file", example="normal=normal_####.exr")
+
+    from svgf_jax import streaming
+    from svgf_jax.frames import open_source
+    from svgf_jax.outputs import WriteOptions, numbers
+
+    source = open_source(
+        input_,
+        frames=frames,
+        missing=missing,
+        channel={role: names.split(",") for role, names in roles.items()},
+        file=files,
+        cameras=None if cameras == "none" else cameras,
+    )
+    terminal.warn(source.warnings)
+    if verbose:
+        terminal.tell(f"input: {source.sequence.name}, {len(source.sequence.files)} frames")
+        terminal.tell(source.roles.describe())
+        terminal.tell(f"preset {chosen_preset}: {numbers(chosen, config)}")
+    with _until_interrupted() as interruption, terminal.progress(len(source.sequence.files)) as on_frame:
+        summary = streaming.run(
+            source,
+            out,
+            params=chosen,
+            config=config,
+            preset=chosen_preset,
+            options=WriteOptions(float_, compression, only_denoised, diagnostics, png, exposure),
+            video=video,
+            fps=fps,
+            resume=resume,
+            overwrite=overwrite,
+            device=device,
+            checkpoint_every=checkpoint_every,
+            on_frame=on_frame,
+            stop=lambda: bool(interruption),
+        )
+    _conclude(summary, verbose=verbose)
+    if json:
+        terminal.print_json(summary._asdict() | {"preset": chosen_preset} | numbers(chosen, config))
+    if summary.interrupted:
+        again = [argument for argument in sys.argv[1:] if argument != "--overwrite"]
+        again = again if "--resume" in again else [*again, "--resume"]
+        terminal.tell(f"interrupted; every file in {out} is complete. Continue with: svgf-jax {shlex.join(again)}")
+        return 128 + interruption[0]
+    return 0
+
+
+def _conclude(summary: "Summary", *, verbose: bool) -> None:
+    """Tell what was done, and every repair and oddity on the way."""
+    done = sum(summary.statuses.values())
+    terminal.warn(summary.notes)
+    if summary.counts:
+        repaired = ", ".join(f"{count} {reason}" for reason, count in summary.counts.items())
+        terminal.warn([f"pixels repaired: {repaired}"])
+    if verbose and summary.device:
+        terminal.tell(f"device: {summary.device}")
+    if summary.resumed_at == summary.frames:
+        terminal.tell(f"nothing to do: all {summary.frames} frames are in {summary.out} already")
+    else:
+        kinds = ", ".join(f"{count} {status}" for status, count in summary.statuses.items())
+        before = f" after {summary.resumed_at} done before" if summary.resumed_at else ""
+        terminal.tell(f"{done} frames ({kinds}){before} in {summary.seconds:.1f} s -> {summary.out}")
+    if summary.video:
+        terminal.tell(f"video: {summary.video}")
+
+
+@contextmanager
+def _until_interrupted() -> Iterator[list[int]]:
+    """A list that receives the number of a SIGINT or SIGTERM; a second SIGINT interrupts at once."""
+    received: list[int] = []
+
+    def on_signal(number: int, _: object) -> None:
+        received.append(number)
+        terminal.tell("stopping after this frame" + ("; Ctrl-C again stops at once" if number == signal.SIGINT else ""))
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
