@@ -78,8 +78,7 @@ def find_camera(cameras: Cameras, number: int) -> Camera:
 
 def pixel_centres(shape: tuple[int, ...], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
     """`[H, W, 2]` screen coordinates of pixel centres; `origin` is the first pixel's place on the screen (a crop)."""
-    y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(np.float64)
-    return np.stack([x + origin[0] + 0.5, y + origin[1] + 0.5], -1)
+    return np.stack(np.broadcast_arrays(*_pixel_centres(shape, origin)), -1)
 
 
 def position_from_depth(camera: Camera, depth: np.ndarray, *, origin: tuple[int, int] = (0, 0)) -> np.ndarray:
@@ -125,21 +124,40 @@ def reproject(
     """
     camera, before = find_camera(cameras, number), find_camera(cameras, previous)
     surface = object_id != -1
-    with np.errstate(all="ignore"):  # what is not finite in the file stays so: the filter counts it
-        if position is None:
-            position = position_from_depth(camera, np.where(surface, depth, 1.0), origin=origin)
-        point = previous_position(cameras, position, object_id, number=number, previous=previous)
-        there = point @ before.world_to_camera[:3, :3].T + before.world_to_camera[:3, 3]
-        away = _seen_at(camera, np.ones_like(depth), origin) - _seen_at(camera, np.zeros_like(depth), origin)
-        away = _from_camera(camera, away, 0.0) @ before.world_to_camera[:3, :3].T
-        there = np.where(surface[..., None], there, away)
-        column = before.camera_to_screen[:, 3] * np.where(surface, 1.0, 0.0)[..., None]
-        screen = there @ before.camera_to_screen[:, :3].T + column
-        ahead = screen[..., 3] > 0
-        pixel = np.where(ahead[..., None], screen[..., :2] / np.where(ahead, screen[..., 3], 1.0)[..., None], BEHIND)
-        motion = pixel - pixel_centres(depth.shape, origin)
-        prev_depth = np.where(surface, there[..., 2], 0.0)
-    return prev_depth.astype(np.float32), motion.astype(np.float32)
+    with np.errstate(all="ignore"):
+        point = _before(cameras, depth, object_id, number, previous, position, origin)
+        point = point @ before.world_to_camera[:3, :3].T + before.world_to_camera[:3, 3]
+        prev_depth = np.where(surface, point[..., 2], 0.0).astype(np.float32)
+        if not surface.all():
+            away = _seen_at(camera, np.ones_like(depth), origin) - _seen_at(camera, np.zeros_like(depth), origin)
+            away = _from_camera(camera, away, 0.0) @ before.world_to_camera[:3, :3].T
+            point = np.where(surface[..., None], point, away)
+        rows = before.camera_to_screen
+        width = _dot(point, rows[3]) + rows[3, 3] * surface
+        ahead = width > 0
+        x, y = _pixel_centres(depth.shape, origin)
+        motion = np.empty((*depth.shape, 2), np.float32)
+        for axis, centre in enumerate((x, y)):
+            screen = (_dot(point, rows[axis]) + rows[axis, 3] * surface) / np.where(ahead, width, 1.0)
+            motion[..., axis] = np.where(ahead, screen, BEHIND) - centre
+    return prev_depth, motion
+
+
+def previous_depth(
+    cameras: Cameras,
+    depth: np.ndarray,
+    object_id: np.ndarray,
+    *,
+    number: int,
+    previous: int,
+    position: np.ndarray | None = None,
+    origin: tuple[int, int] = (0, 0),
+) -> np.ndarray:
+    """The first result of `reproject` alone, for frames that bring their motion with them."""
+    with np.errstate(all="ignore"):
+        point = _before(cameras, depth, object_id, number, previous, position, origin)
+        forward = find_camera(cameras, previous).world_to_camera[2]
+        return np.where(object_id != -1, _dot(point, forward) + forward[3], 0.0).astype(np.float32)
 
 
 def position_residual(camera: Camera, position: np.ndarray, *, origin: tuple[int, int] = (0, 0)) -> np.ndarray:
@@ -154,20 +172,46 @@ def position_residual(camera: Camera, position: np.ndarray, *, origin: tuple[int
         return np.hypot(apart[..., 0], apart[..., 1])
 
 
+def _pixel_centres(shape: tuple[int, ...], origin: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """x `[1, W]` and y `[H, 1]` of the pixel centres."""
+    return np.arange(shape[1])[None, :] + origin[0] + 0.5, np.arange(shape[0])[:, None] + origin[1] + 0.5
+
+
+def _dot(point: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """`[H, W]`: the first three numbers of a row with points `[H, W, 3]`."""
+    return point @ row[:3]
+
+
+def _before(
+    cameras: Cameras,
+    depth: np.ndarray,
+    object_id: np.ndarray,
+    number: int,
+    previous: int,
+    position: np.ndarray | None,
+    origin: tuple[int, int],
+) -> np.ndarray:
+    """`previous_position` of what is seen. What is not finite in the file stays so: the filter counts it."""
+    if position is None:
+        depth = np.where(object_id != -1, depth, 1.0)
+        position = position_from_depth(find_camera(cameras, number), depth, origin=origin)
+    return previous_position(cameras, position, object_id, number=number, previous=previous)
+
+
 def _seen_at(camera: Camera, depth: np.ndarray, origin: tuple[int, int]) -> np.ndarray:
     """Camera-space point `[H, W, 3]` at z = depth that lands on each pixel's centre.
 
     With rows r of camera_to_screen, X - px W = 0 and Y - py W = 0 are two linear equations in x and y.
     """
     rows = camera.camera_to_screen
-    centre = pixel_centres(depth.shape, origin)
-    to_x = rows[0] - centre[..., :1] * rows[3]
-    to_y = rows[1] - centre[..., 1:] * rows[3]
-    right_x = -(to_x[..., 2] * depth + to_x[..., 3])
-    right_y = -(to_y[..., 2] * depth + to_y[..., 3])
-    determinant = to_x[..., 0] * to_y[..., 1] - to_x[..., 1] * to_y[..., 0]
-    x = (right_x * to_y[..., 1] - to_x[..., 1] * right_y) / determinant
-    y = (to_x[..., 0] * right_y - right_x * to_y[..., 0]) / determinant
+    px, py = _pixel_centres(depth.shape, origin)
+    to_x = [rows[0, k] - px * rows[3, k] for k in range(4)]  # each [1, W]
+    to_y = [rows[1, k] - py * rows[3, k] for k in range(4)]  # each [H, 1]
+    right_x = -(to_x[2] * depth + to_x[3])
+    right_y = -(to_y[2] * depth + to_y[3])
+    determinant = to_x[0] * to_y[1] - to_x[1] * to_y[0]
+    x = (right_x * to_y[1] - to_x[1] * right_y) / determinant
+    y = (to_x[0] * right_y - right_x * to_y[0]) / determinant
     return np.stack([x, y, depth], -1)
 
 
@@ -181,8 +225,12 @@ def _object_motion(cameras: Cameras, number: int, previous: int) -> dict[int, np
     """World -> world from one frame to another by object id, for the objects that move."""
     here, there = find_camera(cameras, number), find_camera(cameras, previous)
     if not here.object_motion and not there.object_motion:
-        both = here.object_to_world.keys() & there.object_to_world.keys()
-        return {key: there.object_to_world[key] @ np.linalg.inv(here.object_to_world[key]) for key in both}
+        pairs = {
+            key: (there.object_to_world[key], pose)
+            for key, pose in here.object_to_world.items()
+            if key in there.object_to_world
+        }
+        return {key: past @ np.linalg.inv(now) for key, (past, now) in pairs.items() if not np.array_equal(past, now)}
     motion: dict[int, np.ndarray] = {}
     for step in range(number, previous, -1):  # frame by frame: object_motion reaches back by one
         for key, matrix in find_camera(cameras, step).object_motion.items():

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from svgf_jax import exr
-from svgf_jax.cameras import Cameras, find_camera, load_cameras, reproject
+from svgf_jax.cameras import Cameras, find_camera, load_cameras, previous_depth, reproject
 from svgf_jax.exr_layout import PathName, Window
 from svgf_jax.roles import Roles, canonical_role, check_channels, resolve_roles
 from svgf_jax.sequences import Missing, Sequence, companion, find_sequence
@@ -211,17 +211,12 @@ def _past(
     skipped = bool(before) and before[-1] != number - 1
     if before and source.cameras and planes.keys() & {"depth", "position"}:
         (left, top, *_), (screen_left, screen_top, *_) = source.data_window, source.display_window
-        prev_depth, derived = reproject(
-            source.cameras,
-            depth,
-            object_id,
-            number=number,
-            previous=before[-1],
-            position=planes.get("position"),
-            origin=(left - screen_left, top - screen_top),
-        )
+        where: Any = {"number": number, "previous": before[-1], "position": planes.get("position")}
+        where["origin"] = (left - screen_left, top - screen_top)
         if skipped or "motion" not in planes:
-            motion = derived
+            prev_depth, motion = reproject(source.cameras, depth, object_id, **where)
+        else:
+            prev_depth = previous_depth(source.cameras, depth, object_id, **where)
     elif skipped and "motion" in planes:
         notes.append(
             f"frame {number} follows frame {before[-1]}, but its motion vectors lead to frame {number - 1}; "

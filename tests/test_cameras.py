@@ -12,6 +12,7 @@ from svgf_jax.cameras import (
     pixel_centres,
     position_from_depth,
     position_residual,
+    previous_depth,
     reproject,
 )
 
@@ -93,6 +94,7 @@ def test_motion_agrees_with_a_loop_over_points_of_moving_objects(make):
         screen = PERSPECTIVE @ there
         np.testing.assert_allclose(prev_depth[y, x], there[2], rtol=1e-6)
         np.testing.assert_allclose(motion[y, x] + [x + 0.5, y + 0.5], screen[:2] / screen[3], atol=1e-4)
+    np.testing.assert_allclose(previous_depth(cameras, depth, ids, number=5, previous=4), prev_depth, rtol=1e-6)
     given, same = reproject(cameras, depth, ids, number=5, previous=4, position=position)
     np.testing.assert_allclose(given, prev_depth, rtol=1e-6)
     np.testing.assert_allclose(same, motion, atol=1e-4)
