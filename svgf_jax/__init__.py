@@ -15,9 +15,17 @@ if TYPE_CHECKING:
     from svgf_jax.color import remodulate as remodulate
     from svgf_jax.color import tonemap as tonemap
     from svgf_jax.edges import edge_weight as edge_weight
+    from svgf_jax.frames import load_sequence as load_sequence
+    from svgf_jax.frames import open_source as open_source
+    from svgf_jax.frames import read_frame as read_frame
+    from svgf_jax.parameters import load_params as load_params
+    from svgf_jax.parameters import preset as preset
+    from svgf_jax.parameters import save_params as save_params
     from svgf_jax.pipeline import denoise as denoise
     from svgf_jax.pipeline import init as init
     from svgf_jax.pipeline import step as step
+    from svgf_jax.references import load_reference as load_reference
+    from svgf_jax.references import read_radiance as read_radiance
     from svgf_jax.reprojection import reproject as reproject
     from svgf_jax.sanitation import sanitise as sanitise
     from svgf_jax.types import Config as Config
@@ -37,7 +45,10 @@ _HOME = {
     "atrous": ["atrous_filter", "atrous_level"],
     "color": ["demodulate", "luminance", "remodulate", "tonemap"],
     "edges": ["edge_weight"],
+    "frames": ["load_sequence", "open_source", "read_frame"],
+    "parameters": ["load_params", "preset", "save_params"],
     "pipeline": ["denoise", "init", "step"],
+    "references": ["load_reference", "read_radiance"],
     "reprojection": ["reproject"],
     "sanitation": ["sanitise"],
     "types": ["Config", "Frame", "History", "Output", "Params", "Rejected", "Reprojected", "SvgfError"],

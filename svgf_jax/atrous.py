@@ -6,7 +6,7 @@ import numpy as np
 from jax import Array
 
 from svgf_jax.color import luminance_of_planes
-from svgf_jax.edges import Guides, depth_gradient, geometry_exponent, guides_of, luminance_scale
+from svgf_jax.edges import depth_gradient, geometry_exponent, guides_of, luminance_scale
 from svgf_jax.sampling import STRIP_ROWS, planes, square_offsets, sum_over_taps
 from svgf_jax.types import Config, Frame, Params, at_level
 
@@ -14,7 +14,13 @@ _OFFSETS = square_offsets(2)
 
 
 def atrous_filter(
-    illumination: Array, variance: Array, frame: Frame, *, params: Params, config: Config, strip_rows: int | None = STRIP_ROWS
+    illumination: Array,
+    variance: Array,
+    frame: Frame,
+    *,
+    params: Params,
+    config: Config,
+    strip_rows: int | None = STRIP_ROWS,
 ) -> tuple[Array, Array, Array]:
     """All levels, with step sizes 1, 2, 4, ...
 
@@ -39,7 +45,13 @@ def atrous_filter(
 
 
 def atrous_level(
-    illumination: Array, variance: Array, frame: Frame, *, level: int, params: Params, strip_rows: int | None = STRIP_ROWS
+    illumination: Array,
+    variance: Array,
+    frame: Frame,
+    *,
+    level: int,
+    params: Params,
+    strip_rows: int | None = STRIP_ROWS,
 ) -> tuple[Array, Array]:
     """One level: C' = sum h w C / sum h w and V' = sum h^2 w^2 V / (sum h w)^2 over 5 x 5 taps 2**level apart (equations 1, 2).
 
@@ -57,7 +69,9 @@ def atrous_level(
         for v in prefiltered
     )
     one = jnp.ones((), illumination.dtype)
-    kernel = jnp.stack([jnp.asarray(k, illumination.dtype) * one for k in (scalars.kernel_far, scalars.kernel_near, 1.0)])
+    kernel = jnp.stack(
+        [jnp.asarray(k, illumination.dtype) * one for k in (scalars.kernel_far, scalars.kernel_near, 1.0)]
+    )
     kernel = jnp.concatenate([kernel, kernel[1::-1]])  # (far, near, 1, near, far)
     steps = (_OFFSETS * 2**level).astype(illumination.dtype)
 

@@ -36,7 +36,9 @@ def check_frame(frame: Frame) -> None:
     for name in Frame._fields:
         wanted_dtype = jnp.int32 if name == "object_id" else dtype
         if getattr(frame, name).dtype != wanted_dtype:
-            raise SvgfError(f"{name} is {getattr(frame, name).dtype}; wanted {jnp.dtype(wanted_dtype)}, like the rest of the frame")
+            raise SvgfError(
+                f"{name} is {getattr(frame, name).dtype}; wanted {jnp.dtype(wanted_dtype)}, like the rest of the frame"
+            )
 
 
 def check_params(params: Params, config: Config, *, dtype) -> Params:

@@ -102,9 +102,7 @@ def reproject(history: History, frame: Frame, *, params: Params, strip_rows: int
     strip = jax.checkpoint(strip, prevent_cse=False)  # type: ignore[assignment]
     result = lax.map(strip, jnp.arange(count, dtype=jnp.int32) * rows)
     (illumination, moments, length), valid = jax.tree.map(lambda a: a.reshape(count * rows, width)[:height], result)
-    return Reprojected(
-        illumination=_stack(illumination), moments=_stack(moments), history_length=length, valid=valid
-    )
+    return Reprojected(illumination=_stack(illumination), moments=_stack(moments), history_length=length, valid=valid)
 
 
 def _position(motion: Array, first_row: Array, axis: int, extent: int) -> Array:

@@ -100,7 +100,9 @@ def sum_over_taps(
 
     def strip(first_row: Array) -> Planes:
         zero = jnp.zeros_like(first_row)
-        window = jax.tree.map(lambda a: lax.dynamic_slice(a, (first_row, zero), (rows + 2 * top, width + 2 * left)), padded)
+        window = jax.tree.map(
+            lambda a: lax.dynamic_slice(a, (first_row, zero), (rows + 2 * top, width + 2 * left)), padded
+        )
         p, wanted = jax.tree.map(lambda a: lax.dynamic_slice(a, (first_row, zero), (rows, width)), centred)
         if wanted is None:
             return compute(window, p)

@@ -81,10 +81,7 @@ def estimate_variance(
     )
     boost = jnp.maximum(1.0, scalars.short_history_boost / jnp.maximum(history_length, 1.0))
     variance = jnp.stack(
-        [
-            jnp.where(short, around * boost, _variance(m1, m2))
-            for around, (m1, m2) in zip(spatial, signals, strict=True)
-        ]
+        [jnp.where(short, around * boost, _variance(m1, m2)) for around, (m1, m2) in zip(spatial, signals, strict=True)]
     )
     return jnp.where((frame.object_id != -1)[None], variance, 0.0)
 

@@ -1,0 +1,175 @@
+"""Presets and parameter files.
+
+A parameter file is TOML:
+
+    preset = "paper"            # where values come from that are not given below; optional
+
+    [params]                    # numbers of `Params`: one value, or one per a-trous level
+    alpha = 0.4
+    sigma_luminance = [4.0, 3.5, 3.0, 3.0, 2.5]
+
+    [config]                    # static choices of `Config`
+    levels = 5
+
+    [provenance]                # free: what it was tuned on, when, with which version, error before and after
+"""
+
+import difflib
+import math
+import os
+import tempfile
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from svgf_jax.types import Config, Params, SvgfError
+
+PRESETS: dict[str, tuple[Params, Config]] = {
+    "paper": (Params(), Config()),
+    "falcor": (
+        Params(alpha=0.05, sigma_luminance=10.0, short_history_boost=4.0),
+        Config(levels=4, feedback_level=1),
+    ),
+}
+
+# Where each number must lie: (least, most), open ends excluded.
+_POSITIVE = (0.0, math.inf)
+BOUNDS: dict[str, tuple[float, float]] = {
+    "alpha": (0.0, 1.0),
+    "alpha_moments": (0.0, 1.0),
+    "sigma_depth": _POSITIVE,
+    "sigma_normal": _POSITIVE,
+    "sigma_luminance": _POSITIVE,
+    "short_history_boost": (1.0, math.inf),
+    "max_history": (1.0, math.inf),
+    "albedo_floor": _POSITIVE,
+    "depth_epsilon": _POSITIVE,
+    "luminance_epsilon": _POSITIVE,
+    "reproject_depth": _POSITIVE,
+    "reproject_normal": (-1.0, 1.0),
+    "kernel_near": _POSITIVE,
+    "kernel_far": _POSITIVE,
+}
+_MAX_LEVELS = 12
+
+
+def preset(name: str) -> tuple[Params, Config]:
+    """The parameters and choices of a preset: `paper` (Schied et al. 2017) or `falcor` (NVIDIA Falcor's SVGFPass)."""
+    if name not in PRESETS:
+        raise SvgfError(f"no preset {name!r}; there are {', '.join(PRESETS)}{_suggest(name, PRESETS)}")
+    return PRESETS[name]
+
+
+def load_params(path: str | os.PathLike[str]) -> tuple[Params, Config]:
+    """Read a parameter file. Raises `SvgfError` that names the file, the key, what was got and what was wanted."""
+    file = Path(path)
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise SvgfError(f"{file}: no such parameter file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SvgfError(f"{file}: can't be read as text: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SvgfError(f"{file}: not TOML: {error}") from None
+
+    known = {"preset", "params", "config", "provenance"}
+    for key in content.keys() - known:
+        raise SvgfError(f"{file}: unknown key {key!r}; wanted {', '.join(sorted(known))}{_suggest(key, known)}")
+    for table in known - {"preset"}:
+        if not isinstance(content.get(table, {}), dict):
+            raise SvgfError(f"{file}: {table} is {content[table]!r}; wanted a table, [{table}]")
+    try:
+        params, config = preset(content.get("preset", "paper"))
+        return override(params, config, {**content.get("config", {}), **content.get("params", {})})
+    except (SvgfError, TypeError) as error:
+        raise SvgfError(f"{file}: {error}") from None
+
+
+def save_params(
+    path: str | os.PathLike[str],
+    params: Params,
+    config: Config = Config(),
+    *,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a parameter file that `load_params` reads back to the same numbers; under a temporary name, then renamed."""
+    file = Path(path)
+    text = to_toml(params, config, provenance=provenance)
+    try:
+        handle, temporary = tempfile.mkstemp(prefix=f".{file.name}.", suffix=".tmp", dir=file.parent)
+        with os.fdopen(handle, "w", encoding="utf-8") as out:
+            out.write(text)
+            out.flush()
+            os.fsync(out.fileno())
+        Path(temporary).replace(file)
+    except OSError as error:
+        raise SvgfError(f"{file}: can't write the parameters: {error}") from None
+
+
+def to_toml(params: Params, config: Config = Config(), *, provenance: Mapping[str, Any] | None = None) -> str:
+    """The text of a parameter file."""
+    content: dict[str, Any] = {
+        "params": {name: _plain(value) for name, value in params._asdict().items()},
+        "config": config._asdict(),
+    }
+    if provenance:
+        content["provenance"] = dict(provenance)
+    return tomli_w.dumps(content)
+
+
+def override(params: Params, config: Config, values: Mapping[str, Any]) -> tuple[Params, Config]:
+    """Replace numbers of `params` and choices of `config` by name, checked against their ranges and the number of levels."""
+    names = (*Params._fields, *Config._fields)
+    for name in values:
+        if name not in names:
+            raise SvgfError(f"no parameter {name!r}; there are {', '.join(names)}{_suggest(name, names)}")
+    config = config._replace(**{k: _choice(k, v) for k, v in values.items() if k in Config._fields})
+    given = {k: _number(k, v, config.levels) for k, v in values.items() if k in Params._fields}
+    params = params._replace(**given)
+    for name, value in params._asdict().items():
+        _number(name, _plain(value), config.levels)  # a preset's per-level values must fit the levels asked for
+    return params, config
+
+
+def _choice(name: str, value: Any) -> int:
+    least = {"levels": 0, "feedback_level": -1}[name]
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= _MAX_LEVELS:
+        raise SvgfError(f"{name} = {value!r}; wanted a whole number from {least} to {_MAX_LEVELS}")
+    return value
+
+
+def _number(name: str, value: Any, levels: int) -> Any:
+    per_level = isinstance(value, list | tuple)
+    entries = list(value) if per_level else [value]
+    if per_level and len(entries) != levels:
+        raise SvgfError(f"{name} has {len(entries)} values; wanted one, or one for each of the {levels} levels")
+    least, most = BOUNDS[name]
+    for entry in entries:
+        if (
+            isinstance(entry, bool)
+            or not isinstance(entry, int | float)
+            or not least <= entry <= most
+            or math.isinf(entry)
+        ):
+            raise SvgfError(f"{name} = {entry!r}; wanted a number from {least:g} to {most:g}")
+    return _per_level(entries) if per_level else float(value)
+
+
+def _per_level(entries: list) -> Any:
+    import numpy as np
+
+    return np.asarray(entries, dtype=np.float64)
+
+
+def _plain(value: Any) -> Any:
+    """A float, or a list of floats, out of whatever array a parameter is held in."""
+    value = value.tolist() if hasattr(value, "tolist") else value
+    return [float(v) for v in value] if isinstance(value, list | tuple) else float(value)
+
+
+def _suggest(name: Any, known: Any) -> str:
+    close = difflib.get_close_matches(str(name), list(known), n=1)
+    return f". Did you mean {close[0]}?" if close else ""

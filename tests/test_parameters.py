@@ -1,0 +1,69 @@
+"""Presets and parameter files: what is written is read back, what is wrong is named."""
+
+import numpy as np
+import pytest
+
+import svgf_jax as sj
+from svgf_jax.parameters import override
+
+
+def test_presets_are_those_of_the_paper_and_of_falcor():
+    params, config = sj.preset("paper")
+    assert (params.alpha, params.sigma_luminance, config.levels, config.feedback_level) == (0.2, 4.0, 5, 0)
+    params, config = sj.preset("falcor")
+    assert (params.alpha, params.sigma_luminance, params.short_history_boost) == (0.05, 10.0, 4.0)
+    assert (config.levels, config.feedback_level) == (4, 1)
+
+
+def test_a_file_reads_back_to_the_same_numbers(tmp_path):
+    params = sj.Params(alpha=1 / 3, sigma_luminance=np.array([4.0, 3.0, 2.5, 1.0, 0.1]))
+    sj.save_params(tmp_path / "p.toml", params, sj.Config(levels=5, feedback_level=1), provenance={"on": "a sequence"})
+    loaded, config = sj.load_params(tmp_path / "p.toml")
+    assert config == sj.Config(levels=5, feedback_level=1)
+    for got, wanted in zip(loaded, params, strict=True):
+        np.testing.assert_array_equal(got, wanted)
+    assert [p.name for p in tmp_path.iterdir()] == ["p.toml"]
+
+
+def test_a_file_may_build_on_a_preset(tmp_path):
+    (tmp_path / "p.toml").write_text('preset = "falcor"\n[params]\nalpha = 0.5\n')
+    params, config = sj.load_params(tmp_path / "p.toml")
+    assert (params.alpha, params.sigma_luminance, config.levels) == (0.5, 10.0, 4)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("[params]\nalhpa = 0.5", "alpha"),
+        ("[params]\nalpha = 1.5", "alpha = 1.5"),
+        ("[params]\nalpha = nan", "alpha = nan"),
+        ("[params]\nalpha = true", "alpha = True"),
+        ("[params]\nalpha = 'a'", "alpha = 'a'"),
+        ("[params]\nsigma_normal = [1.0, 2.0]", "5 levels"),
+        ("[config]\nlevels = 2.5", "levels = 2.5"),
+        ("[config]\nlevels = 400", "levels = 400"),
+        ("preset = 'paperr'", "Did you mean paper"),
+        ("params = 3", "wanted a table"),
+        ("pramas = 3", "unknown key 'pramas'"),
+        ("not toml", "not TOML"),
+        ("preset = 3", "no preset"),
+    ],
+)
+def test_a_wrong_file_is_refused_by_name(tmp_path, text, complaint):
+    (tmp_path / "p.toml").write_text(text)
+    with pytest.raises(sj.SvgfError, match="p.toml") as error:
+        sj.load_params(tmp_path / "p.toml")
+    assert complaint in str(error.value)
+
+
+def test_a_missing_file_and_a_missing_folder_are_named(tmp_path):
+    with pytest.raises(sj.SvgfError, match="no such parameter file"):
+        sj.load_params(tmp_path / "p.toml")
+    with pytest.raises(sj.SvgfError, match="can't write"):
+        sj.save_params(tmp_path / "no" / "p.toml", sj.Params())
+
+
+def test_fewer_levels_do_not_silently_drop_per_level_values():
+    params, config = override(*sj.preset("paper"), {"sigma_normal": [1.0, 2.0, 3.0, 4.0, 5.0]})
+    with pytest.raises(sj.SvgfError, match="4 levels"):
+        override(params, config, {"levels": 4})
