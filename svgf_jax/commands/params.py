@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -46,11 +46,14 @@ def show(
         source: A preset, or a file.
         set_: One value changed; a comma list gives one value per a-trous level. Repeatable.
     """
-    from svgf_jax import parameters
+    import tomli_w
+
+    from svgf_jax.outputs import numbers
 
     from_file = source.endswith(".toml")
     _, params, config = settings.choose(None if from_file else source, Path(source) if from_file else None, set_)
-    print(parameters.to_toml(params, config), end="")
+    values = numbers(params, config)
+    print(tomli_w.dumps({"params": values["parameters"], "config": values["config"]}), end="")
 
 
 def _meanings(cls: type) -> dict[str, str]:
@@ -60,5 +63,5 @@ def _meanings(cls: type) -> dict[str, str]:
     return {name: " ".join(meaning.split()) for name, meaning in entries}
 
 
-def _short(value: object) -> str:
-    return ", ".join(f"{item:g}" for item in value) if isinstance(value, tuple | list) else f"{value:g}"
+def _short(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, int | float) else ", ".join(f"{item:g}" for item in value)

@@ -1,6 +1,5 @@
 """Options that set numbers and names: `--preset`, `--params`, `--set NAME=VALUE`, `--channel ROLE=...`. No JAX."""
 
-import difflib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,12 +14,10 @@ def choose(preset: str | None, file: Path | None, changes: Iterable[str]) -> tup
         raise SvgfError(f"Got --preset {preset} and --params {file}; wanted one of them. --set changes single values.")
     name = preset or "paper"
     params, config = parameters.preset(name) if file is None else parameters.load_params(file)
+    texts = assignments(changes, option="--set", example="sigma_normal=64")
+    params, config = parameters.override(params, config, {key: _value(key, text) for key, text in texts.items()})
     record = name if file is None else file.name
-    for change in changes:
-        key, text = _split(change, option="--set", example="sigma_normal=64")
-        params, config = _change(params, config, key, text)
-        record += f" {change}"
-    return record, params, config
+    return " ".join([record, *(f"{key}={text}" for key, text in texts.items())]), params, config
 
 
 def assignments(texts: Iterable[str], *, option: str, example: str) -> dict[str, str]:
@@ -41,21 +38,12 @@ def _split(text: str, *, option: str, example: str) -> tuple[str, str]:
     return key, value
 
 
-def _change(params: Params, config: Config, key: str, text: str) -> tuple[Params, Config]:
-    """One value replaced, by its name and as text."""
-    if key in Config._fields:
-        try:
-            return params, config._replace(**{key: int(text)})
-        except ValueError as error:
-            raise SvgfError(f"Got --set {key}={text}; wanted a whole number.") from error
-    if key not in Params._fields:
-        names = [*Params._fields, *Config._fields]
-        close = difflib.get_close_matches(key, names, n=3) or names
-        raise SvgfError(f"There is no parameter {key!r}. Closest: {', '.join(close)}. See `svgf-jax params list`.")
+def _value(key: str, text: str) -> int | float | list[float]:
+    """A number, or a comma list of one per a-trous level; whole numbers for the choices in `Config`."""
+    kind = int if key in Config._fields else float
     try:
-        values = tuple(float(item) for item in text.split(","))
+        values = [kind(item) for item in text.split(",")]
     except ValueError as error:
-        raise SvgfError(
-            f"Got --set {key}={text}; wanted a number, or one per a-trous level separated by commas: {key}=4,3,2,1,1."
-        ) from error
-    return params._replace(**{key: values[0] if len(values) == 1 else values}), config
+        wanted = "a whole number" if kind is int else f"a number, or one per a-trous level: {key}=4,3,2,1,1"
+        raise SvgfError(f"Got --set {key}={text}; wanted {wanted}.") from error
+    return values[0] if len(values) == 1 else values

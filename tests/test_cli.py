@@ -1,0 +1,357 @@
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shots import write_frame, write_shot
+
+from svgf_jax import exr
+
+ROOT = Path(__file__).parents[1]
+PRELUDE = """
+import atexit, resource, sys
+def tell():
+    use = resource.getrusage(resource.RUSAGE_SELF)
+    heavy = sorted({name.split('.')[0] for name in sys.modules} & {'jax', 'jaxlib', 'numpy', 'rich'})
+    print('TELL', use.ru_utime + use.ru_stime, *heavy, file=sys.stderr)
+atexit.register(tell)
+sys.argv[0] = 'svgf-jax'
+from svgf_jax.__main__ import main
+main()
+"""
+
+
+def command(*arguments, cwd=None, **options):
+    """Run `svgf-jax` in a process of its own."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "100"}
+    call = [sys.executable, "-m", "svgf_jax", *map(str, arguments)]
+    return subprocess.run(call, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120, **options)
+
+
+def observed(*arguments, cwd=None):
+    """(exit code, standard error, processor seconds, heavy modules imported) of a command."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    call = [sys.executable, "-c", PRELUDE, *map(str, arguments)]
+    done = subprocess.run(call, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120)
+    error, _, told = done.stderr.rpartition("TELL ")
+    seconds, *modules = told.split()
+    return done.returncode, error, float(seconds), set(modules)
+
+
+# Answers at once
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["denoise", "--help"], ["compare", "--help"], ["--version"]])
+def test_help_is_quick_and_imports_nothing_heavy(arguments):
+    runs = [observed(*arguments) for _ in range(3)]
+    assert [code for code, *_ in runs] == [0, 0, 0]
+    assert not runs[0][3] & {"jax", "jaxlib", "numpy"}
+    assert min(seconds for _, _, seconds, _ in runs) < 0.5
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory):
+    """Several small sequences, good and bad, that no test changes."""
+    folder = tmp_path_factory.mktemp("shots")
+    write_shot(folder / "good", [1, 2, 3])
+    write_shot(folder / "gap", [1, 3])
+    write_shot(folder / "resized", [1, 2])
+    write_frame(folder / "resized" / "shot.0003.exr", 3, size=(9, 9))
+    write_shot(folder / "cut", [1, 2])
+    first = folder / "cut" / "shot.0001.exr"
+    first.write_bytes(first.read_bytes()[:3000])
+    write_shot(folder / "empty_file", [1])
+    (folder / "empty_file" / "shot.0001.exr").write_bytes(b"")
+    write_shot(folder / "renamed", [1])
+    path = folder / "renamed" / "shot.0001.exr"
+    image = exr.read(path)
+    exr.write(path, image._replace(channels={k.replace("albedo", "[red]albdo"): v for k, v in image.channels.items()}))
+    (folder / "nothing").mkdir()
+    (folder / "file").write_text("")
+    return folder
+
+
+ERRORS = {
+    "no command": (["denoize", "x"], "denoise"),
+    "no output": (["denoise", "good"], "--out"),
+    "unknown flag": (["denoise", "good", "-o", "out", "--pngs"], "--png"),
+    "wrong choice": (["denoise", "good", "-o", "out", "--missing", "skip"], "hold"),
+    "no such folder": (["denoise", "god", "-o", "out"], "good"),
+    "nothing inside": (["denoise", "nothing", "-o", "out"], "no EXR"),
+    "missing frame": (["denoise", "gap", "-o", "out"], "--missing hold|reset"),
+    "bad range": (["denoise", "good", "-o", "out", "--frames", "one"], "1-100x2"),
+    "cut off": (["denoise", "cut", "-o", "out"], "cut off"),
+    "zero bytes": (["denoise", "empty_file", "-o", "out"], "empty"),
+    "channel not there": (
+        ["denoise", "renamed", "-o", "out", "--channel", "albedo=albdo.R,albdo.G,albdo.B"],
+        "[red]albdo",
+    ),
+    "bad channel option": (["denoise", "good", "-o", "out", "--channel", "albedo"], "albedo=foo.R,foo.G,foo.B"),
+    "no such role": (["denoise", "good", "-o", "out", "--channel", "albdo=a,b,c"], "albedo"),
+    "unknown preset": (["denoise", "good", "-o", "out", "--preset", "papr"], "paper"),
+    "unknown parameter": (["denoise", "good", "-o", "out", "--set", "sigma_norml=3"], "sigma_normal"),
+    "not a number": (["denoise", "good", "-o", "out", "--set", "alpha=much"], "wanted a number"),
+    "not whole": (["denoise", "good", "-o", "out", "--set", "levels=2.5"], "whole number"),
+    "out of range": (["denoise", "good", "-o", "out", "--set", "alpha=7"], "alpha"),
+    "too few per level": (["denoise", "good", "-o", "out", "--set", "sigma_normal=1,2"], "sigma_normal"),
+    "two parameter sets": (["denoise", "good", "-o", "out", "--preset", "paper", "--params", "a.toml"], "one of them"),
+    "no parameter file": (["denoise", "good", "-o", "out", "--params", "a.toml"], "a.toml"),
+    "output is a file": (["denoise", "good", "-o", "file"], "wanted a folder"),
+    "output under a file": (["denoise", "good", "-o", "file/out"], "Cannot write into the output folder"),
+    "output over input": (["denoise", "good", "-o", "good"], "would replace an input"),
+    "resume and overwrite": (["denoise", "good", "-o", "out", "--resume", "--overwrite"], "Choose one"),
+    "bad fps": (["denoise", "good", "-o", "out", "--fps", "fast"], "fps"),
+    "nothing to compare": (["compare", "god", "good"], "good"),
+    "different sizes": (["compare", "resized", "good"], "pixels"),
+    "unknown shown preset": (["params", "show", "papr"], "paper"),
+}
+
+
+@pytest.mark.parametrize("case", ERRORS)
+def test_errors_are_plain_quick_and_leave_nothing(shots, case):
+    arguments, hint = ERRORS[case]
+    before = sorted(path for path in shots.rglob("*"))
+    code, error, seconds, modules = observed(*arguments, cwd=shots)
+    assert code == 2
+    assert hint in error
+    assert "Traceback" not in error
+    assert not modules & {"jax", "jaxlib"}
+    assert seconds < 0.8  # 0.3 on an idle machine; processor time still swells on a busy one
+    assert sorted(path for path in shots.rglob("*")) == before
+
+
+# Denoising for real
+
+
+@pytest.fixture(scope="module")
+def denoised(shots, tmp_path_factory):
+    """(finished process, output folder) of a run with most options."""
+    out = tmp_path_factory.mktemp("denoised") / "a" / "b"
+    done = command(
+        *("denoise", "good", "-o", out, "--preset", "falcor", "--set", "sigma_normal=64", "--set", "levels=2"),
+        *("--diagnostics", "--float", "--compression", "zips", "--png", "--json", "-v"),
+        cwd=shots,
+    )
+    return done, out
+
+
+def test_denoise_writes_frames_and_tells_what_it_does(denoised, shots):
+    done, out = denoised
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in out.glob("*.*") if path.is_file()) == [
+        f"shot.000{i}.{kind}" for i in (1, 2, 3) for kind in ("exr", "png")
+    ]
+    for number in (1, 2, 3):
+        assert re.search(rf"^frame {number}: filtered in \d+\.\d\d s -> .*shot\.000{number}\.exr", done.stderr, re.M)
+    assert "albedo    albedo.R albedo.G albedo.B (native name)" in done.stderr
+    assert "3 frames (3 filtered) in" in done.stderr
+    summary = json.loads(done.stdout)
+    assert summary["frames"] == 3
+    assert summary["preset"] == "falcor sigma_normal=64 levels=2"
+    assert summary["parameters"]["sigma_normal"] == 64
+    assert summary["config"]["levels"] == 2
+    image = exr.read(out / "shot.0003.exr")
+    assert image.channels["R"].dtype == np.float32
+    assert image.channels["svgf.history_length"].max() == 3
+    assert image.attributes["svgf_jax:preset"] == "falcor sigma_normal=64 levels=2"
+
+
+def test_denoise_is_less_noisy_than_its_input(denoised, shots):
+    out = denoised[1]
+    channels = exr.read(out / "shot.0003.exr").channels
+    noisy, clean = channels["direct.G"] + channels["indirect.G"], channels["G"]
+    assert clean[:, 4:].astype(float).std() < 0.5 * noisy[:, 4:].astype(float).std()
+
+
+def test_a_terminal_gets_a_progress_bar(shots, tmp_path):
+    pty = pytest.importorskip("pty")
+    reading, writing = pty.openpty()
+    call = [sys.executable, "-m", "svgf_jax", "denoise", "good", "-o", str(tmp_path / "out"), "--set", "levels=1"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "120"}
+    process = subprocess.Popen(call, cwd=shots, env=environment, stderr=writing, stdout=subprocess.DEVNULL)
+    os.close(writing)
+    shown = b""
+    while True:
+        try:
+            chunk = os.read(reading, 4096)
+        except OSError:  # the other end is closed
+            break
+        if not chunk:
+            break
+        shown += chunk
+    os.close(reading)
+    assert process.wait(60) == 0
+    assert b"frames/s" in shown
+    assert b"3/3" in shown
+
+
+LONG = ["denoise", "in", "--set", "levels=0", "--checkpoint-every", "5", "-o"]
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory):
+    """A folder with a longer sequence in `in`, and in `whole` what an uninterrupted run makes of it."""
+    folder = tmp_path_factory.mktemp("long")
+    write_shot(folder / "in", range(1, 41), layers=False)
+    assert command(*LONG, "whole", cwd=folder).returncode == 0
+    return folder
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_command_resumes_to_the_same_bits(long, number):
+    out = long / f"out{number}"
+    call = [sys.executable, "-m", "svgf_jax", *LONG, out.name]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(call, cwd=long, env=environment, stderr=subprocess.PIPE, text=True)
+    while "frame 2:" not in process.stderr.readline():
+        assert process.poll() is None
+    process.send_signal(number)
+    told = process.communicate(timeout=60)[1]
+    assert process.returncode == 128 + number
+    assert "Traceback" not in told
+    assert f"Continue with: svgf-jax {' '.join(LONG)} {out.name} --resume" in told
+    assert not list(out.glob(".*.tmp"))
+    files = sorted(out.glob("*.exr"))
+    assert 2 <= len(files) < 40
+    for path in files:
+        exr.read(path)
+    assert command(*LONG, out.name, "--resume", cwd=long).returncode == 0
+    for path in (long / "whole").glob("*.exr"):
+        assert (out / path.name).read_bytes() == path.read_bytes()
+    again = command(*LONG, out.name, "--resume", cwd=long)
+    assert again.returncode == 0
+    assert "nothing to do" in again.stderr
+
+
+KILLED = """
+import sys
+sys.path.insert(0, sys.argv[3])
+from shots import init, step
+from svgf_jax import streaming
+from svgf_jax.frames import open_source
+from svgf_jax.outputs import WriteOptions
+streaming.run(open_source(sys.argv[1]), sys.argv[2], pipeline=(init, step), resume=True, checkpoint_every=3,
+              options=WriteOptions(png=True, diagnostics=True), on_frame=lambda told: print(told.number, flush=True))
+"""
+
+
+def test_killed_at_any_moment_resumes_to_the_same_bits(tmp_path):
+    """kill -9 at random moments. SVGF_KILLS says how often, SVGF_SEED which."""
+    rng = np.random.default_rng(int(os.environ.get("SVGF_SEED", "0")))
+    write_shot(tmp_path / "in", range(1, 61))
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+
+    def start(out):
+        call = [sys.executable, "-c", KILLED, str(tmp_path / "in"), str(tmp_path / out), str(ROOT / "tests")]
+        return subprocess.Popen(call, env=environment, stdout=subprocess.PIPE, text=True)
+
+    process = start("whole")
+    process.stdout.readline()
+    began = time.monotonic()
+    assert len(process.communicate(timeout=120)[0].split()) == 59
+    took = time.monotonic() - began
+    wanted = {path.name: path.read_bytes() for path in (tmp_path / "whole").glob("*.*") if path.is_file()}
+    landed = []
+    for i in range(int(os.environ.get("SVGF_KILLS", "4"))):
+        process = start(f"out{i}")
+        process.stdout.readline()  # the first frame is done
+        time.sleep(rng.uniform(0, 0.6 * took))
+        process.kill()
+        process.communicate()
+        landed.append(len(list((tmp_path / f"out{i}").glob("*.exr"))))
+        process = start(f"out{i}")
+        process.communicate(timeout=120)
+        assert process.returncode == 0
+        got = {path.name: path.read_bytes() for path in (tmp_path / f"out{i}").glob("*.*") if path.is_file()}
+        assert got == wanted
+    assert any(1 <= count < 60 for count in landed), landed
+
+
+def test_a_disk_that_is_full_is_a_clear_error(shots, tmp_path):
+    resource = pytest.importorskip("resource")
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
+
+    done = command("denoise", "good", "-o", tmp_path / "out", "--set", "levels=1", cwd=shots, preexec_fn=limit)
+    assert done.returncode == 2, done.stderr
+    assert "cannot be written" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list((tmp_path / "out").glob("*.exr"))
+    assert not list((tmp_path / "out").glob(".*.tmp"))
+
+
+def test_text_from_files_is_never_markup(tmp_path):
+    write_shot(tmp_path / "in", [1])
+    path = tmp_path / "in" / "shot.0001.exr"
+    image = exr.read(path)
+    channels = image.channels | {"[bold red]x[reset].R": image.channels["direct.R"]}
+    exr.write(tmp_path / "in" / "[blink]a[reset].0001.exr", image._replace(channels=channels))
+    path.unlink()
+    done = command("denoise", "in", "-o", "out", "--set", "levels=1", "-v", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "[blink]a[reset].0001.exr" in done.stderr
+
+
+# Comparing
+
+
+@pytest.fixture(scope="module")
+def references(shots, tmp_path_factory):
+    """References of the sequence `good` and one frame more."""
+    folder = tmp_path_factory.mktemp("references")
+    write_shot(folder, [1, 2, 3, 4])
+    return folder
+
+
+def test_compare_prints_and_saves_all_scores(denoised, references, tmp_path):
+    out = denoised[1]
+    done = command("compare", out, references, "--json", tmp_path / "a.json", "--csv", tmp_path / "a.csv")
+    assert done.returncode == 0, done.stderr
+    assert "frames 4 are in only one of the sequences" in done.stderr
+    for word in ("PSNR", "relMSE", "SSIM", "temporal", "mean"):
+        assert word in done.stdout
+    report = json.loads((tmp_path / "a.json").read_text())
+    assert [row["frame"] for row in report["frames"]] == [1, 2, 3]
+    assert report["frames"][0]["temporal"] is None
+    assert report["frames"][1]["temporal"] > 0
+    assert report["mean"]["psnr"] == pytest.approx(np.mean([row["psnr"] for row in report["frames"]]))
+    with (tmp_path / "a.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["frame"] for row in rows] == ["1", "2", "3", "mean"]
+    assert float(rows[-1]["psnr"]) == pytest.approx(report["mean"]["psnr"])
+    done = command("compare", out, references, "--json", tmp_path / "a.json")
+    assert done.returncode == 2
+    assert "--overwrite" in done.stderr
+
+
+def test_compare_with_itself_is_perfect(references):
+    pytest.importorskip("flip_evaluator")
+    done = command("compare", references, references, "--frames", "1-2", "--flip")
+    assert done.returncode == 0, done.stderr
+    assert "inf" in done.stdout
+    assert "HDR-FLIP" in done.stdout
+
+
+# Parameters
+
+
+def test_params_list_and_show(tmp_path):
+    done = command("params", "list")
+    assert done.returncode == 0, done.stderr
+    for word in ("paper", "falcor", "sigma_normal", "feedback_level", "128"):
+        assert word in done.stdout
+    done = command("params", "show", "falcor", "--set", "sigma_luminance=4,3,2,1")
+    assert done.returncode == 0, done.stderr
+    (tmp_path / "mine.toml").write_text(done.stdout)
+    again = command("params", "show", tmp_path / "mine.toml")
+    assert again.stdout == done.stdout
+    assert "sigma_luminance" in done.stdout
