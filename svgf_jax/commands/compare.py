@@ -71,7 +71,7 @@ def compare(
 
 
 def print_scores(title: str, rows: Mapping[str, "Scores"]) -> None:
-    """A table on the standard output, the last row set apart; columns without any score are left out."""
+    """A table on the standard output, the row `mean` set apart; columns without any score are left out."""
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
@@ -82,8 +82,8 @@ def print_scores(title: str, rows: Mapping[str, "Scores"]) -> None:
     table.add_column(Text(title))
     for name in names:
         table.add_column(COLUMNS[name][0], justify="right")
-    for i, (label, score) in enumerate(rows.items()):
-        if i and i == len(rows) - 1:
+    for label, score in rows.items():
+        if label == "mean":
             table.add_section()
         values = [getattr(score, name) for name in names]
         cells = [

@@ -97,7 +97,9 @@ def denoise(
     if verbose:
         terminal.tell(f"input: {source.sequence.name}, {len(source.sequence.files)} frames")
         terminal.tell(source.roles.describe())
-        terminal.tell(f"preset {chosen_preset}: {numbers(chosen, config)}")
+        values = numbers(chosen, config)
+        listed = ", ".join(f"{name} {value}" for name, value in (values["parameters"] | values["config"]).items())
+        terminal.tell(f"preset {chosen_preset}: {listed}")
     with _until_interrupted() as interruption, terminal.progress(len(source.sequence.files)) as on_frame:
         summary = streaming.run(
             source,
