@@ -87,4 +87,7 @@ def estimate_variance(
 
 
 def _variance(first: Array, second: Array) -> Array:
-    return jnp.maximum(0.0, second - first * first)
+    # At 0 the derivative is 0 too (V is a minimum there); jnp.maximum would pass half of a rounding error on to sqrt, whose
+    # derivative at a variance that a strong edge made tiny but not 0 is larger than 1e40.
+    difference = second - first * first
+    return jnp.where(difference > 0.0, difference, 0.0)
