@@ -1,0 +1,60 @@
+"""Before and after, measured with the library's own metrics, shot by shot."""
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import cache, partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from svgf_jax import Config, Frame, Params, init, step
+from svgf_jax.metrics import Scores, mean_scores, score
+from svgf_jax.threads import read_ahead
+from tune.shots import Shot
+
+
+class Measured(NamedTuple):
+    """Scores of a shot: of each frame with a reference, and of the whole."""
+
+    name: str
+    frames: tuple[Scores, ...]
+    mean: Scores
+
+
+def measure(shot: Shot, params: Params, config: Config, *, with_flip: bool = False) -> Measured:
+    """Denoise a shot whose targets are references, and score it. One frame in memory at a time."""
+    scores: list[Scores] = []
+    previous = None
+    for image, target in filtered(shot, params, config):
+        if target is None:
+            previous = None
+            continue
+        scores.append(score(image, target, previous=previous, with_flip=with_flip))
+        previous = (image, target)
+    return Measured(shot.name, tuple(scores), mean_scores(scores))
+
+
+def filtered(shot: Shot, params: Params, config: Config) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+    """(filtered image `[H, W, 3]`, target) of each frame of a shot."""
+    run = _step(config)
+    history = None
+    with closing(read_ahead(shot.read, range(shot.length), threads=1)) as examples:
+        for frame, target in examples:
+            frame = Frame(*frame)
+            leaves = Params(*(np.asarray(leaf, np.asarray(frame.depth).dtype) for leaf in params))
+            history, output = run(init(frame) if history is None else history, frame, params=leaves)
+            yield np.asarray(output.image), target
+
+
+def worse(before: Measured, after: Measured, *, tolerance: float = 0.0) -> str | None:
+    """In what a shot got worse, as a sentence; None if it did not: PSNR (by more than `tolerance` dB)."""
+    loss = before.mean.psnr - after.mean.psnr
+    if loss > tolerance or np.isnan(after.mean.psnr):
+        return f"{after.name}: PSNR fell from {before.mean.psnr:.2f} to {after.mean.psnr:.2f} dB"
+    return None
+
+
+@cache
+def _step(config: Config) -> Callable:
+    return jax.jit(partial(step, config=config))

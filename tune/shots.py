@@ -1,0 +1,117 @@
+"""What a fit is fed: shots, each a sequence of frames with what they should have looked like, read one at a time."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from svgf_jax import Frame, SvgfError, open_source, read_frame, read_radiance
+from svgf_jax.sequences import find_sequence, format_range
+
+
+class Example(NamedTuple):
+    """One frame and its target `[H, W, 3]`; None = there is no target for it, and the filter only runs through it."""
+
+    frame: Frame
+    target: np.ndarray | None
+
+
+class Shot(NamedTuple):
+    """A sequence.
+
+    Attributes:
+        name: for people.
+        length: number of frames.
+        read: index -> `Example` of NumPy arrays; called from other threads, and anew for each pass.
+        notes: what the user should know before the work starts, as sentences.
+    """
+
+    name: str
+    length: int
+    read: Callable[[int], Example]
+    notes: tuple[str, ...] = ()
+
+
+def shot_of_arrays(frames: Frame, targets: Any, *, name: str = "frames") -> Shot:
+    """A shot held in memory: a `Frame` with a leading T, and targets `[T, H, W, 3]`."""
+    targets = np.asarray(targets)
+    if targets.shape != np.shape(frames.emission):
+        raise SvgfError(
+            f"{name}: targets of shape {targets.shape} for frames of {np.shape(frames.emission)}; "
+            "wanted one image [H, W, 3] of the same size for each frame"
+        )
+
+    def read(index: int) -> Example:
+        return Example(Frame(*(np.asarray(leaf[index]) for leaf in frames)), targets[index])
+
+    return Shot(name, targets.shape[0], read)
+
+
+def shot_of_files(
+    noisy: str,
+    target: str,
+    *,
+    frames: str | None = None,
+    prefer: Sequence[str] = ("ref", "reference", "frame"),
+    **options: Any,
+) -> Shot:
+    """A shot on the disk.
+
+    Args:
+        noisy: whatever `svgf_jax.open_source` takes.
+        target: the references: a folder, a pattern or a file; paired by frame number.
+        frames: only these.
+        prefer: which sequence of a folder of targets to take.
+        **options: of `svgf_jax.open_source`.
+
+    Raises:
+        SvgfError: not found, no frame in common.
+    """
+    source = open_source(noisy, frames=frames, **options)
+    wanted = find_sequence(target, missing="reset", prefer=tuple(prefer))
+    paths = {number: path for number, path in wanted.files if path is not None}
+    numbers = [number for number, _ in source.sequence.files]
+    missing = [number for number in numbers if number not in paths]
+    if len(missing) == len(numbers):
+        raise SvgfError(
+            f"{wanted.name} (frames {format_range(paths)}) has none of the frames {format_range(numbers)} of "
+            f"{source.sequence.name}; wanted the same frame numbers in both."
+        )
+    notes = list(source.warnings)
+    if missing:
+        notes.append(
+            f"{wanted.name} lacks frames {format_range(missing)} of {source.sequence.name}: the filter runs through them, "
+            "and they count for nothing."
+        )
+
+    def read(index: int) -> Example:
+        frame = read_frame(source, index).frame
+        path = paths.get(numbers[index])
+        if path is None:
+            return Example(frame, None)
+        image = read_radiance(path)
+        if image.shape != frame.emission.shape:
+            got, want = image.shape, frame.emission.shape
+            raise SvgfError(
+                f"{path} is {got[1]} x {got[0]} pixels, the noisy frame {numbers[index]} {want[1]} x {want[0]}; "
+                "wanted references of the same size. Render them anew, or crop both alike."
+            )
+        return Example(frame, image)
+
+    return Shot(str(noisy), len(numbers), read, tuple(notes))
+
+
+def window(shot: Shot, *, rows: slice = slice(None), columns: slice = slice(None), frames: slice = slice(None)) -> Shot:
+    """A crop of a shot in space and time. What comes into the crop from outside has no history."""
+    indices = range(shot.length)[frames]
+
+    def read(index: int) -> Example:
+        frame, target = shot.read(indices[index])
+        axes = {"depth": 0, "prev_depth": 0, "object_id": 0, "radiance": 1, "albedo": 1}
+        cut = {
+            name: np.ascontiguousarray(leaf[(slice(None),) * (axes.get(name) == 1) + (rows, columns)])
+            for name, leaf in frame._asdict().items()
+        }
+        return Example(Frame(**cut), None if target is None else np.ascontiguousarray(target[rows, columns]))
+
+    return shot._replace(length=len(indices), read=read)
