@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from svgf_jax.color import luminance as luminance
     from svgf_jax.color import remodulate as remodulate
     from svgf_jax.color import tonemap as tonemap
+    from svgf_jax.demo import sample as sample
     from svgf_jax.edges import edge_weight as edge_weight
     from svgf_jax.frames import load_sequence as load_sequence
     from svgf_jax.frames import open_source as open_source
@@ -44,6 +45,7 @@ _HOME = {
     "accumulation": ["accumulate"],
     "atrous": ["atrous_filter", "atrous_level"],
     "color": ["demodulate", "luminance", "remodulate", "tonemap"],
+    "demo": ["sample"],
     "edges": ["edge_weight"],
     "frames": ["load_sequence", "open_source", "read_frame"],
     "parameters": ["load_params", "preset", "save_params"],
