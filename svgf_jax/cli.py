@@ -39,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except SvgfError as error:
         fail(str(error))
     except KeyboardInterrupt:
+        print("svgf-jax: interrupted; files with their final name are complete", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:  # `| head`: whoever read the output has had enough
         sys.stderr.close()

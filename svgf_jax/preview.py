@@ -79,7 +79,7 @@ def write_video(path: str | Path, pictures: Iterable[np.ndarray], *, fps: float 
 
 def copy_file(source: str | Path, path: str | Path) -> None:
     """Copy a file, under a temporary name and then renamed. `SvgfError` where that fails."""
-    _write_atomically(path, lambda temporary: shutil.copyfile(source, temporary) and None)
+    _write_atomically(path, lambda temporary: shutil.copyfile(source, temporary))
 
 
 def require_video() -> None:
@@ -98,7 +98,7 @@ def _av():
         ) from error
 
 
-def _write_atomically(path: str | Path, write: Callable[[str], None], *failures: type[Exception]) -> None:
+def _write_atomically(path: str | Path, write: Callable[[str], object], *failures: type[Exception]) -> None:
     """Call `write(temporary name in the same folder)`, make it durable, rename it to `path`."""
     temporary = str(Path(path).with_name(f".{Path(path).name}.{uuid.uuid4().hex[:8]}.tmp"))
     try:

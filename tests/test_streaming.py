@@ -95,6 +95,21 @@ def test_pictures_and_video(shot, tmp_path):
     assert summary.video == tmp_path / "out" / "shot.mp4"
 
 
+def test_an_interrupted_video_is_made_by_resuming_without_filtering_again(shot, tmp_path, monkeypatch):
+    pytest.importorskip("av")
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(streaming.preview, "write_video", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(shot, tmp_path / "out", video=True)
+    summary = run(shot, tmp_path / "out", video=True, resume=True)
+    assert (summary.resumed_at, summary.statuses) == (7, {})
+    assert (tmp_path / "out" / "shot.mp4").exists()
+
+
 def test_existing_outputs_are_never_replaced_unasked(shot, tmp_path):
     run(shot, tmp_path / "out")
     before = contents(tmp_path / "out")

@@ -142,7 +142,7 @@ def _conclude(summary: "Summary", *, verbose: bool) -> None:
     else:
         kinds = ", ".join(f"{count} {status}" for status, count in summary.statuses.items())
         before = f" after {summary.resumed_at} done before" if summary.resumed_at else ""
-        terminal.tell(f"{done} frames ({kinds}){before} in {summary.seconds:.1f} s -> {summary.out}")
+        terminal.tell(f"{done} frame{'s' * (done != 1)} ({kinds}){before} in {summary.seconds:.1f} s -> {summary.out}")
     if summary.video:
         terminal.tell(f"video: {summary.video}")
 
