@@ -1,6 +1,7 @@
 """Fit the filter's numbers to a renderer's own noise. Imports only the public `svgf_jax`, which never imports this.
 
-`tune.fit(params, config, shots)` takes shots from `tune.shot_of_files` or `tune.shot_of_arrays`. Names are imported when first used.
+`tune.fit(params, config, shots)` takes shots from `tune.shot_of_files` or `tune.shot_of_arrays`. Names are imported when first
+used.
 """
 
 from importlib import import_module

@@ -14,7 +14,7 @@ import numpy as np
 
 from svgf_jax import SvgfError
 from svgf_jax.threads import read_ahead
-from tune.fold import BLOCK_ROWS, combine, factor_blocks
+from tune.fold import combine, factor_blocks
 from tune.free import GATES, Coordinates
 from tune.residuals import Term
 from tune.shots import Example, Shot
@@ -131,14 +131,8 @@ def _reduce(block: tuple[jax.Array, list[jax.Array]]) -> tuple[float, np.ndarray
     loss = float(residual @ residual)
     if not block[1]:
         return loss, None, None
-    columns = [np.asarray(part) for part in block[1]]
-    matrix = np.empty((residual.size, sum(len(part) for part in columns) + 1))
-    at = 0
-    for part in columns:
-        matrix[:, at : at + len(part)] = part.T
-        at += len(part)
-    matrix[:, -1] = residual
-    factors = factor_blocks(matrix, block_rows=BLOCK_ROWS)
+    rows = np.concatenate([*map(np.asarray, block[1]), np.asarray(block[0])[None]]).T
+    factors = factor_blocks(rows)
     gradients = np.einsum("bki,bk->bi", factors[:, :, :-1], factors[:, :, -1])
     return loss, combine(factors), gradients.T @ gradients
 

@@ -1,0 +1,91 @@
+"""A fit on the disk between two iterations, so that it can be resumed bit for bit: numbers only, nothing that is executed."""
+
+import json
+import os
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from svgf_jax import SvgfError
+from tune.fitting import Iteration, Progress
+from tune.solver import Descent, arrays, restored
+
+FORMAT = 1
+
+
+def save(path: Path, progress: Progress, identity: dict[str, Any]) -> None:
+    """Write `progress` of the fit that `identity` (JSON) describes; under a temporary name, then renamed."""
+    state = arrays(progress.descent)
+    rows = progress.iterations
+    header = {
+        "format": FORMAT,
+        "identity": identity,
+        "start": progress.start,
+        "ended": progress.ended,
+        "states": len(state),
+        "found": progress.found is not None,
+    }
+    content = {
+        "header": np.array(json.dumps(header)),
+        "trials": np.array([[i.start, i.number, i.loss, i.accepted, i.damping] for i in rows]).reshape(len(rows), 5),
+        "values": np.array([i.values for i in rows]),
+        "losses": np.array([progress.loss, progress.best_loss]),
+        "best_y": progress.best_y,
+        "pixel_weights": progress.pixel_weights,
+        **{f"state{i}": value for i, value in enumerate(state)},
+    }
+    if progress.found is not None:
+        content |= {"triangle": progress.found[0], "scatter": progress.found[1], "rows": np.array(progress.found[2])}
+    try:
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, **content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise SvgfError(f"{path}: can't write the checkpoint: {error}") from None
+
+
+def load(path: Path, fresh: Descent, identity: dict[str, Any]) -> Progress:
+    """The progress that `path` holds; `fresh` is a descent of the same solver and size, just begun.
+
+    Raises SvgfError: not there, damaged, or of another fit than `identity`.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            content = {name: file[name] for name in file.files}
+        header = json.loads(str(content["header"]))
+        if header["format"] != FORMAT:
+            raise SvgfError(f"{path}: written by another version; start anew without --resume")
+        _compare(path, header["identity"], json.loads(json.dumps(identity)))
+        trials = zip(content["trials"], content["values"], strict=True)
+        return Progress(
+            start=header["start"],
+            descent=restored(fresh, [content[f"state{i}"] for i in range(header["states"])]),
+            iterations=tuple(
+                Iteration(int(t[0]), int(t[1]), float(t[2]), bool(t[3]), values, float(t[4])) for t, values in trials
+            ),
+            loss=float(content["losses"][0]),
+            best_y=content["best_y"],
+            best_loss=float(content["losses"][1]),
+            found=(content["triangle"], content["scatter"], int(content["rows"])) if header["found"] else None,
+            ended=header["ended"],
+            pixel_weights=content["pixel_weights"],
+        )
+    except FileNotFoundError:
+        raise SvgfError(f"{path}: no checkpoint to resume from; start without --resume") from None
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise SvgfError(f"{path}: damaged ({error}); delete it and start without --resume") from None
+
+
+def _compare(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None:
+    for key in stored.keys() | wanted.keys():
+        if stored.get(key) != wanted.get(key):
+            raise SvgfError(
+                f"{path}: belongs to another fit: its {key} was {stored.get(key)!r}, now it is {wanted.get(key)!r}. "
+                "Give the same options, or start anew without --resume."
+            )
