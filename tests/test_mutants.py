@@ -1,0 +1,338 @@
+"""Known bugs of other SVGF codes, put into this one: each must fail the test that it names.
+
+A mutant is a change of the text of one module (what is replaced must be there, exactly once). The changed text is run as
+that module, everything that imports it anew on top of it, and the named test is called with these in place.
+"""
+
+import importlib
+import inspect
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+import pytest
+import test_stages_oracle
+
+import svgf_jax
+
+STAGES = (
+    "color", "sampling", "edges", "sanitation", "reprojection", "accumulation", "variance", "atrous", "pipeline",
+)  # fmt: skip
+
+
+class Mutant(NamedTuple):
+    """`changes` of text in the module, and the test of `test_stages_oracle` (with its arguments) that fails."""
+
+    module: str
+    changes: tuple[tuple[str, str], ...]
+    caught_by: str
+    arguments: tuple = ()
+
+
+def mutant(module, old, new, caught_by, *arguments):
+    return Mutant(module, ((old, new),), caught_by, arguments)
+
+
+SLOPE = """            p["slope"][0] * distance_x + p["slope"][1] * distance_y,"""
+ISOTROPIC = (
+    """            jnp.maximum(jnp.abs(p["slope"][0]), jnp.abs(p["slope"][1])) * jnp.hypot(distance_x, distance_y),"""
+)
+
+MUTANTS = {
+    # Temporal accumulation
+    "moments blended the wrong way round": mutant(
+        "accumulation",
+        "_blend(previous.moments, moments, weight_moments)",
+        "_blend(moments, previous.moments, weight_moments)",
+        "test_accumulate",
+    ),
+    "illumination blended the wrong way round": mutant(
+        "accumulation",
+        "_blend(previous.illumination, illumination, weight)",
+        "_blend(illumination, previous.illumination, weight)",
+        "test_accumulate",
+    ),
+    "history length without a cap": mutant(
+        "accumulation",
+        "jnp.minimum(previous.history_length + 1.0, scalars.max_history)",
+        "(previous.history_length + 1.0)",
+        "test_accumulate",
+    ),
+    "history length rounded down": mutant(
+        "accumulation",
+        "jnp.minimum(previous.history_length + 1.0,",
+        "jnp.minimum(jnp.floor(previous.history_length) + 1.0,",
+        "test_accumulate",
+    ),
+    "1 / (h + 1) for 1 / h": mutant(
+        "accumulation", "1.0 / jnp.maximum(length, 1.0)", "1.0 / (length + 1.0)", "test_accumulate"
+    ),
+    "alpha even without history": mutant(
+        "accumulation",
+        "jnp.where(valid, jnp.maximum(alpha, 1.0 / jnp.maximum(length, 1.0)), 1.0)",
+        "alpha * jnp.ones_like(length)",
+        "test_accumulate",
+    ),
+    "moments of the accumulated light": mutant(
+        "accumulation",
+        "luminance(illumination)",
+        "luminance(_blend(previous.illumination, illumination, weight))",
+        "test_accumulate",
+    ),
+    "luminance of Rec. 601": mutant("color", "(0.2126, 0.7152, 0.0722)", "(0.299, 0.587, 0.114)", "test_luminance"),
+    "modulated without the floor": mutant(
+        "color",
+        "illumination * jnp.maximum(albedo, albedo_floor)",
+        "illumination * albedo",
+        "test_remodulate_undoes_demodulate",
+    ),
+    "floor added instead of applied": mutant(
+        "color", "radiance / jnp.maximum(albedo, albedo_floor)", "radiance / (albedo + albedo_floor)", "test_demodulate"
+    ),
+    # Reprojection
+    "no history in the first row and column": mutant(
+        "sampling", "(row >= 0) & (row < height) & (column >= 0)", "(row >= 1) & (row < height) & (column >= 1)",
+        "test_reproject",
+    ),
+    "the last row and column left out": mutant(
+        "sampling", "(row < height) & (column >= 0) & (column < width)",
+        "(row < height - 1) & (column >= 0) & (column < width - 1)", "test_reproject",
+    ),
+    "one bounds test for all four taps": mutant(
+        "reprojection",
+        "        found = weight >= _LEAST_WEIGHT",
+        "        found = (weight >= _LEAST_WEIGHT) & (y >= 0) & (y <= height - 1) & (x >= 0) & (x <= width - 1)",
+        "test_reproject",
+    ),
+    "all four taps or none": mutant(
+        "reprojection", "found = weight >= _LEAST_WEIGHT", "found = weight >= 1.0 - 1e-9", "test_reproject"
+    ),
+    "any weight will do": mutant("reprojection", "_LEAST_WEIGHT = 0.01", "_LEAST_WEIGHT = 1e-30",
+                                 "test_reproject_trusts_no_sliver"),
+    "weights not renormalised": mutant(
+        "reprojection", "jnp.where(found, weight, jnp.where(found_around", "jnp.where(found, 1.0, jnp.where(found_around",
+        "test_reproject",
+    ),
+    "no 3 x 3 fallback": mutant(
+        "reprojection", "found_around = missing & (around > 0.0)", "found_around = missing & (around < 0.0)", "test_reproject"
+    ),
+    "fallback around the pixel to the upper left": mutant(
+        "reprojection", "jnp.floor(y + 0.5).astype(jnp.int32), jnp.floor(x + 0.5)",
+        "jnp.floor(y).astype(jnp.int32), jnp.floor(x)", "test_reproject",
+    ),
+    "object ids not compared": mutant(
+        "reprojection", "(q_id == p[\"id\"])", "(q_id != -1)", "test_reproject_tells_objects_apart_by_id_alone"
+    ),
+    "depth not compared": mutant(
+        "reprojection", " & near & ", " & ", "test_reproject_compares_the_depth_that_the_surface_had"
+    ),
+    "depth compared with what it is now": mutant(
+        "reprojection", "\"depth\": frame.prev_depth,", "\"depth\": frame.depth,",
+        "test_reproject_compares_the_depth_that_the_surface_had",
+    ),
+    "depth difference compared with its sign": mutant(
+        "reprojection", "jnp.abs(read(guides[\"depth\"]) - p[\"depth\"]) <=", "read(guides[\"depth\"]) - p[\"depth\"] <=",
+        "test_reproject_compares_the_depth_that_the_surface_had",
+    ),
+    "normals not compared": mutant(
+        "reprojection", " & (n[0] + n[1] + n[2] >= scalars.reproject_normal)", "",
+        "test_reproject_compares_the_depth_that_the_surface_had",
+    ),
+    "motion with the opposite sign": mutant(
+        "reprojection", ".astype(motion.dtype) + motion,", ".astype(motion.dtype) - motion,", "test_reproject"
+    ),
+    "history length of the nearest pixel": mutant(
+        "reprojection",
+        "return means, found | found_around",
+        "return (*means[:2], read_at(history.history_length, jnp.floor(y + 0.5).astype(jnp.int32),"
+        " jnp.floor(x + 0.5).astype(jnp.int32))[0]), found | found_around",
+        "test_reproject",
+    ),
+    # Variance
+    "no boost of the short history": mutant(
+        "variance", "around * boost", "around", "test_estimate_variance"
+    ),
+    "boost below one": mutant(
+        "variance", "jnp.maximum(1.0, scalars.short_history_boost /", "(scalars.short_history_boost /",
+        "test_estimate_variance",
+    ),
+    "four frames told without slack": mutant("variance", "= 4 - 1e-3", "= 4", "test_estimate_variance"),
+    "spatial estimate for five frames and fewer": mutant("variance", "= 4 - 1e-3", "= 6 - 1e-3", "test_estimate_variance"),
+    "negative variance": mutant(
+        "variance", "jnp.where(difference > 0.0, difference, 0.0)", "difference", "test_variance_of_a_constant_is_not_negative"
+    ),
+    "a window of 5 x 5": mutant("variance", "_RADIUS = 3", "_RADIUS = 2", "test_estimate_variance"),
+    "window's depth tolerance times three": mutant(
+        "variance", "distance_y, distance_x = t", "distance_y, distance_x = (3.0 * t[0], 3.0 * t[1])", "test_estimate_variance"
+    ),
+    "window's weights without edges": mutant(
+        "variance", "q[\"guides\"].surface * jnp.exp(exponent)", "q[\"guides\"].surface", "test_estimate_variance"
+    ),
+    # A-trous
+    "variance divided by the sum of squared weights": Mutant(
+        "atrous",
+        (
+            ("sums=tuple((zero, (zero, zero, zero), zero) for", "sums=tuple((zero, (zero, zero, zero), (zero, zero)) for"),
+            ("variances + weight * weight * variance", "(variances[0] + weight**2 * variance, variances[1] + weight**2)"),
+            ("variances / divisor / divisor", "variances[0] / jnp.maximum(variances[1], 1e-30)"),
+        ),
+        "test_atrous_level",
+        (0,),
+    ),
+    "variance filtered like the light": Mutant(
+        "atrous",
+        (
+            ("variances + weight * weight * variance", "variances + weight * variance"),
+            ("variances / divisor / divisor", "variances / divisor"),
+        ),
+        "test_atrous_level",
+        (0,),
+    ),
+    "steps starting at 2": Mutant(
+        "atrous",
+        (
+            ("steps = (_OFFSETS * 2**level)", "steps = (_OFFSETS * 2**(level + 1))"),
+            ("offsets=_OFFSETS * 2**level,", "offsets=_OFFSETS * 2**(level + 1),"),
+        ),
+        "test_atrous_level",
+        (0,),
+    ),
+    "variance blur not renormalised": mutant(
+        "atrous", "jnp.where(any_weight, t / jnp.where(any_weight, weights, 1.0), 0.0)", "jnp.where(any_weight, t, 0.0)",
+        "test_atrous_level", 0,
+    ),
+    "no variance blur": mutant(
+        "atrous", "prefiltered = prefilter_variance(variances, guides.surface, strip_rows=strip_rows)",
+        "prefiltered = variances", "test_atrous_level", 0,
+    ),
+    "blurred variance handed on": mutant(
+        "atrous", "\"variance\": variances, \"luma\"", "\"variance\": prefiltered, \"luma\"", "test_atrous_level", 0
+    ),
+    "slope the same in all directions": mutant("atrous", SLOPE, ISOTROPIC, "test_atrous_level", 0),
+    "slope not scaled with the step": mutant(
+        "atrous", "steps = (_OFFSETS * 2**level)", "steps = (_OFFSETS)", "test_atrous_level", 1
+    ),
+    "centre weight zero": mutant(
+        "atrous", "scalars.kernel_near, 1.0)", "scalars.kernel_near, 0.0)", "test_atrous_level", 0
+    ),
+    "kernel inside out": mutant(
+        "atrous", "(scalars.kernel_far, scalars.kernel_near, 1.0)", "(scalars.kernel_near, scalars.kernel_far, 1.0)",
+        "test_atrous_level", 0,
+    ),
+    "luminance of the level before": Mutant(
+        "atrous",
+        (
+            ("    feedback = illumination\n    for level", "    feedback = guide = illumination\n    for level"),
+            ("illumination, variance, frame, level=level,", "illumination, variance, frame, guide=guide, level=level,"),
+            ("    level: int,\n", "    level: int,\n    guide=None,\n"),
+            ("*color) for color in colors)", "*color) for color in (colors if guide is None else map(planes, guide)))"),
+        ),
+        "test_feedback",
+        (1,),
+    ),
+    "history of the next level": mutant(
+        "atrous", "level == min(config.feedback_level, config.levels - 1)", "level == config.feedback_level + 1",
+        "test_feedback", -1,
+    ),
+    "history of no level where feedback_level is beyond the last": mutant(
+        "atrous", "level == min(config.feedback_level, config.levels - 1)", "level == config.feedback_level", "test_feedback", 9
+    ),
+    "parameters of the first level for all": mutant(
+        "atrous", "scalars = at_level(params, level)", "scalars = at_level(params, 0)", "test_atrous_level", 1
+    ),
+    # Edge-stopping weights
+    "variance for deviation": mutant(
+        "edges", "jnp.where(varies, jnp.sqrt(jnp.where(varies, deviation_squared, 1.0)), 0.0)", "deviation_squared",
+        "test_atrous_level", 0,
+    ),
+    "depth tolerance absolute": mutant(
+        "edges", "depth_epsilon * p.depth", "depth_epsilon", "test_atrous_level", 0
+    ),
+    "normals through the back": mutant(
+        "edges", "faces = cosine > 1e-30", "faces = (cosine := jnp.abs(cosine)) > 1e-30", "test_backs_do_not_count"
+    ),
+    "the larger of the depth differences": mutant(
+        "edges", "jnp.abs(ahead) < jnp.abs(behind), ahead, behind", "jnp.abs(ahead) > jnp.abs(behind), ahead, behind",
+        "test_depth_gradient",
+    ),
+    "a tie takes a side": mutant("edges", "0.5 * (ahead + behind)", "ahead", "test_depth_gradient"),
+    "central differences": mutant(
+        "edges", "jnp.abs(ahead) == jnp.abs(behind), 0.5", "jnp.abs(ahead) < 1e9, 0.5", "test_depth_gradient"
+    ),
+    "depth differences across objects": mutant(
+        "edges", "(shift(object_id, sign * dy, sign * dx) == object_id) & ", "", "test_depth_gradient"
+    ),
+    # Sanitising and the whole
+    "infinite radiance kept": mutant(
+        "sanitation", "radiance_finite & radiance_positive, frame", "~jnp.isnan(frame.radiance) & radiance_positive, frame",
+        "test_sanitise",
+    ),
+    "negative radiance kept": mutant("sanitation", "radiance_finite & radiance_positive, frame", "radiance_finite, frame",
+                                     "test_sanitise"),
+    "NaN guides pass as valid": mutant("sanitation", "surface = was_surface & guided", "surface = was_surface", "test_sanitise"),
+    "NaN motion passes as valid": mutant(
+        "sanitation", "(surface & traced)[..., None], frame.motion", "surface[..., None], jnp.nan_to_num(frame.motion)",
+        "test_sanitise",
+    ),
+    "NaN albedo passes as valid": mutant(
+        "sanitation", "        & jnp.isfinite(frame.albedo).all(axis=(0, 3))\n", "", "test_sanitise"
+    ),
+    "emission forgotten": mutant("pipeline", "reflected.sum(axis=0) + frame.emission", "reflected.sum(axis=0)", "test_step"),
+    "background lost": mutant(
+        "pipeline", "jnp.where(surface[None, :, :, None], reflected, frame.radiance)",
+        "jnp.where(surface[None, :, :, None], reflected, 0.0)", "test_background_keeps_its_radiance",
+    ),
+    "filtered light fed back": mutant("pipeline", "illumination=feedback,", "illumination=filtered,", "test_step"),
+}  # fmt: skip
+
+
+def mutated(change: Mutant) -> dict[str, ModuleType]:
+    """The stages' modules, imported anew, one of them changed; what was loaded before stays what it is."""
+    names = [f"svgf_jax.{stage}" for stage in STAGES]
+    kept = {name: sys.modules.pop(name) for name in names if name in sys.modules}
+    try:
+        for stage, name in zip(STAGES, names, strict=True):
+            if stage != change.module:
+                importlib.import_module(name)
+                continue
+            path = Path(inspect.getsourcefile(kept[name]) or "")
+            text = path.read_text(encoding="utf-8")
+            for old, new in change.changes:
+                assert text.count(old) == 1, f"{path.name} has {text.count(old)} times, not once: {old}"
+                text = text.replace(old, new)
+            module = ModuleType(name)
+            module.__file__ = str(path)
+            sys.modules[name] = module
+            exec(compile(text, str(path), "exec"), module.__dict__)  # the mutant
+        return {stage: sys.modules[name] for stage, name in zip(STAGES, names, strict=True)}
+    finally:
+        for name in names:
+            sys.modules.pop(name, None)
+        sys.modules.update(kept)
+        for name, module in kept.items():
+            setattr(svgf_jax, name.removeprefix("svgf_jax."), module)
+
+
+@pytest.mark.parametrize("name", MUTANTS)
+def test_mutant_is_caught(monkeypatch, name):
+    change = MUTANTS[name]
+    for stage, module in mutated(change).items():
+        if hasattr(test_stages_oracle, stage):
+            monkeypatch.setattr(test_stages_oracle, stage, module)
+    with pytest.raises(AssertionError):
+        getattr(test_stages_oracle, change.caught_by)(*change.arguments)
+
+
+def test_the_modules_are_in_place_again():
+    mutated(MUTANTS["emission forgotten"])
+    from svgf_jax import pipeline
+
+    assert sys.modules["svgf_jax.pipeline"] is test_stages_oracle.pipeline is pipeline
+
+
+def test_an_unchanged_module_passes(monkeypatch):
+    for stage, module in mutated(Mutant("atrous", (), "")).items():
+        if hasattr(test_stages_oracle, stage):
+            monkeypatch.setattr(test_stages_oracle, stage, module)
+    test_stages_oracle.test_atrous_level(0)
