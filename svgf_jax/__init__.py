@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from svgf_jax.frames import load_sequence as load_sequence
     from svgf_jax.frames import open_source as open_source
     from svgf_jax.frames import read_frame as read_frame
+    from svgf_jax.modulation import modulate as modulate
     from svgf_jax.parameters import load_params as load_params
     from svgf_jax.parameters import preset as preset
     from svgf_jax.parameters import save_params as save_params
@@ -48,6 +49,7 @@ _HOME = {
     "demo": ["sample"],
     "edges": ["edge_weight"],
     "frames": ["load_sequence", "open_source", "read_frame"],
+    "modulation": ["modulate"],
     "parameters": ["load_params", "preset", "save_params"],
     "pipeline": ["denoise", "init", "step"],
     "references": ["load_reference", "read_radiance"],

@@ -2,10 +2,12 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
-from svgf_jax.color import luminance
+from svgf_jax.color import luminance_of_planes
+from svgf_jax.sampling import in_strips, planes, stack_planes
 from svgf_jax.types import Frame, Params, Reprojected, at_level
 
 
@@ -27,20 +29,30 @@ def accumulate(illumination: Array, previous: Reprojected, frame: Frame, *, para
         params: per-level leaves are read at entry 0.
     """
     scalars = at_level(params, 0)
-    surface = frame.object_id != -1
-    length = jnp.where(previous.valid, jnp.minimum(previous.history_length + 1.0, scalars.max_history), 1.0)
-    weight = _blend_weight(scalars.alpha, length, previous.valid)[None, :, :, None]
-    weight_moments = _blend_weight(scalars.alpha_moments, length, previous.valid)[None, :, :, None]
 
-    luma = jnp.minimum(luminance(illumination), _largest_luminance(illumination.dtype))
-    moments = jnp.stack([luma, luma * luma], axis=-1)
-    blended = _blend(previous.illumination, illumination, weight)
-    blended_moments = _blend(previous.moments, moments, weight_moments)
-    return Accumulated(
-        illumination=jnp.where(surface[None, :, :, None], blended, 0.0),
-        moments=jnp.where(surface[None, :, :, None], blended_moments, 0.0),
-        history_length=jnp.where(surface, length, 0.0),
+    def blend(colors, previous_colors, previous_moments, previous_length, valid, surface):
+        length = jnp.where(valid, jnp.minimum(previous_length + 1.0, scalars.max_history), 1.0)
+        weight = _blend_weight(scalars.alpha, length, valid)
+        weight_moments = _blend_weight(scalars.alpha_moments, length, valid)
+        lumas = [jnp.minimum(luminance_of_planes(*color), _largest_luminance(length.dtype)) for color in colors]
+        moments = [(luma, luma * luma) for luma in lumas]
+        blended = (
+            jax.tree.map(lambda old, new: _blend(old, new, weight), previous_colors, colors),
+            jax.tree.map(lambda old, new: _blend(old, new, weight_moments), previous_moments, tuple(moments)),
+            length,
+        )
+        return jax.tree.map(lambda a: jnp.where(surface, a, 0.0), blended)
+
+    colors, moments, length = in_strips(
+        blend,
+        tuple(map(planes, illumination)),
+        tuple(map(planes, previous.illumination)),
+        tuple(map(planes, previous.moments)),
+        previous.history_length,
+        previous.valid,
+        frame.object_id != -1,
     )
+    return Accumulated(illumination=stack_planes(colors), moments=stack_planes(moments), history_length=length)
 
 
 def _blend_weight(alpha: Array | float, length: Array, valid: Array) -> Array:

@@ -7,9 +7,11 @@ import jax.numpy as jnp
 from jax import lax
 
 from svgf_jax.accumulation import accumulate
+from svgf_jax.adaptation import follow_light
 from svgf_jax.atrous import atrous_filter
 from svgf_jax.check import check_frame, check_params
-from svgf_jax.color import demodulate, remodulate
+from svgf_jax.color import demodulate
+from svgf_jax.modulation import modulate
 from svgf_jax.reprojection import reproject
 from svgf_jax.sanitation import sanitise
 from svgf_jax.types import Config, Frame, History, Output, Params, at_level
@@ -53,16 +55,15 @@ def step(
     floor = at_level(params, 0).albedo_floor
 
     frame, rejected = sanitise(frame)
-    surface = frame.object_id != -1
     illumination = demodulate(frame.radiance, frame.albedo, albedo_floor=floor)
     previous = reproject(history, frame, params=params)
+    previous = follow_light(previous, illumination, frame, params=params, config=config)
     accumulated = accumulate(illumination, previous, frame, params=params)
     variance = estimate_variance(accumulated.moments, accumulated.history_length, frame, params=params)
     filtered, variance_filtered, feedback = atrous_filter(
         accumulated.illumination, variance, frame, params=params, config=config
     )
-    reflected = remodulate(filtered, frame.albedo, albedo_floor=floor)
-    reflected = jnp.where(surface[None, :, :, None], reflected, frame.radiance)
+    image = modulate(filtered, frame, albedo_floor=floor)
 
     history = History(
         illumination=feedback,
@@ -73,7 +74,7 @@ def step(
         object_id=frame.object_id,
     )
     return history, Output(
-        image=reflected.sum(axis=0) + frame.emission,
+        image=image,
         illumination=filtered,
         variance=variance,
         variance_filtered=variance_filtered,

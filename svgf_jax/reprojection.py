@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from svgf_jax.sampling import STRIP_ROWS, planes, read_at, square_offsets
+from svgf_jax.sampling import STRIP_ROWS, planes, read_at, square_offsets, stack_planes, strip_count
 from svgf_jax.types import Frame, History, Params, Reprojected, at_level
 
 _LEAST_WEIGHT = 0.01  # of the consistent ones of the 2 x 2 taps, to be trusted
@@ -28,8 +28,8 @@ def reproject(history: History, frame: Frame, *, params: Params, strip_rows: int
     """
     scalars = at_level(params, 0)
     height, width = frame.depth.shape
-    rows = height if strip_rows is None else -(-height // -(-height // strip_rows))
-    count = -(-height // rows)
+    count = 1 if strip_rows is None else strip_count(height, strip_rows)
+    rows = -(-height // count)
     guides = {"id": history.object_id, "depth": history.depth, "normal": planes(history.normal)}
     values = (tuple(map(planes, history.illumination)), tuple(map(planes, history.moments)), history.history_length)
     current = {
@@ -102,7 +102,9 @@ def reproject(history: History, frame: Frame, *, params: Params, strip_rows: int
     strip = jax.checkpoint(strip, prevent_cse=False)  # type: ignore[assignment]
     result = lax.map(strip, jnp.arange(count, dtype=jnp.int32) * rows)
     (illumination, moments, length), valid = jax.tree.map(lambda a: a.reshape(count * rows, width)[:height], result)
-    return Reprojected(illumination=_stack(illumination), moments=_stack(moments), history_length=length, valid=valid)
+    return Reprojected(
+        illumination=stack_planes(illumination), moments=stack_planes(moments), history_length=length, valid=valid
+    )
 
 
 def _position(motion: Array, first_row: Array, axis: int, extent: int) -> Array:
@@ -110,7 +112,3 @@ def _position(motion: Array, first_row: Array, axis: int, extent: int) -> Array:
     index = lax.broadcasted_iota(jnp.int32, motion.shape, 1 - axis)
     start = first_row if axis == 1 else jnp.zeros_like(first_row)
     return jnp.clip((start + index).astype(motion.dtype) + motion, -4.0, extent + 4.0)
-
-
-def _stack(signals: tuple[tuple[Array, ...], ...]) -> Array:
-    return jnp.stack([jnp.stack(signal, axis=-1) for signal in signals])

@@ -26,6 +26,11 @@ def planes(image: Array) -> tuple[Array, ...]:
     return tuple(image[..., c] for c in range(image.shape[-1]))
 
 
+def stack_planes(signals: tuple[tuple[Array, ...], ...]) -> Array:
+    """S signals of C planes each -> `[S, H, W, C]`."""
+    return jnp.stack([jnp.stack(signal, axis=-1) for signal in signals])
+
+
 def shift(plane: Array, dy: int, dx: int) -> Array:
     """The neighbour at (+dx, +dy): `shift(a, dy, dx)[y, x] == a[y + dy, x + dx]`, 0 outside the image. `[H, W]`."""
     height, width = plane.shape
@@ -33,6 +38,12 @@ def shift(plane: Array, dy: int, dx: int) -> Array:
         return jnp.zeros_like(plane)
     inside = plane[max(dy, 0) : height + min(dy, 0), max(dx, 0) : width + min(dx, 0)]
     return jnp.pad(inside, ((max(-dy, 0), max(dy, 0)), (max(-dx, 0), max(dx, 0))))
+
+
+def strip_count(height: int, strip_rows: int) -> int:
+    """How many strips of about `strip_rows` rows; never one: the compiler would dissolve that loop into its surroundings, and round
+    differently in a scan over frames than in a step by itself."""
+    return max(2, -(-height // strip_rows))
 
 
 def square_offsets(radius: int, step_size: int = 1) -> np.ndarray:
@@ -82,7 +93,7 @@ def sum_over_taps(
             totals = tap(totals, q, centre, jax.tree.map(lambda a, i=i: a[i], per_tap))
         return finish(totals, centre)
 
-    count = -(-height // strip_rows)
+    count = strip_count(height, strip_rows)
     rows = -(-height // count)
     below = count * rows - height
     padded = jax.tree.map(lambda a: jnp.pad(a, ((top, top + below), (left, left))), neighbours)
@@ -112,6 +123,26 @@ def sum_over_taps(
 
     strip = jax.checkpoint(strip, prevent_cse=False)  # type: ignore[assignment]
     result = lax.map(strip, jnp.arange(count, dtype=jnp.int32) * rows)
+    return jax.tree.map(lambda a: a.reshape(count * rows, width)[:height], result)
+
+
+def in_strips(function: Callable[..., Planes], *images: Planes, strip_rows: int = STRIP_ROWS) -> Planes:
+    """Run pixel-wise arithmetic strip by strip: it stays in the cache, and is compiled, hence rounded, the same wherever it is.
+
+    Args:
+        function: trees of planes -> a tree of planes; every pixel by itself.
+        images: trees of planes `[H, W]`.
+        strip_rows: rows per strip, about.
+
+    Returns:
+        The tree that `function` returns, with leaves `[H, W]`.
+    """
+    height, width = jax.tree.leaves(images)[0].shape
+    count = strip_count(height, strip_rows)
+    rows = -(-height // count)
+    padded = jax.tree.map(lambda a: jnp.pad(a, ((0, count * rows - height), (0, 0))), images)
+    split = jax.tree.map(lambda a: a.reshape(count, rows, width), padded)
+    result = lax.map(lambda strips: function(*strips), split)
     return jax.tree.map(lambda a: a.reshape(count * rows, width)[:height], result)
 
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from svgf_jax.edges import depth_gradient, geometry_exponent, guides_of
-from svgf_jax.sampling import STRIP_ROWS, planes, square_offsets, sum_over_taps
+from svgf_jax.sampling import STRIP_ROWS, in_strips, planes, square_offsets, sum_over_taps
 from svgf_jax.types import Frame, Params, at_level
 
 SHORT_HISTORY = 4 - 1e-3  # history length is a real number: a mean of threes and fives must not be decided by rounding
@@ -79,11 +79,13 @@ def estimate_variance(
         where=short,
         strip_rows=strip_rows,
     )
-    boost = jnp.maximum(1.0, scalars.short_history_boost / jnp.maximum(history_length, 1.0))
-    variance = jnp.stack(
-        [jnp.where(short, around * boost, _variance(m1, m2)) for around, (m1, m2) in zip(spatial, signals, strict=True)]
-    )
-    return jnp.where((frame.object_id != -1)[None], variance, 0.0)
+
+    def choose(around, signals, length, short, surface):
+        boost = jnp.maximum(1.0, scalars.short_history_boost / jnp.maximum(length, 1.0))
+        chosen = (jnp.where(short, v * boost, _variance(m1, m2)) for v, (m1, m2) in zip(around, signals, strict=True))
+        return tuple(jnp.where(surface, v, 0.0) for v in chosen)
+
+    return jnp.stack(in_strips(choose, spatial, signals, history_length, short, frame.object_id != -1))
 
 
 def _variance(first: Array, second: Array) -> Array:

@@ -15,7 +15,16 @@ def test_the_public_names_are_these():
     assert set(svgf_jax.__all__) == {
         *("Config", "Frame", "History", "Output", "Params", "Rejected", "Reprojected", "SvgfError"),
         *("init", "step", "denoise"),
-        *("sanitise", "demodulate", "remodulate", "reproject", "accumulate", "estimate_variance", "edge_weight"),
+        *(
+            "sanitise",
+            "demodulate",
+            "remodulate",
+            "modulate",
+            "reproject",
+            "accumulate",
+            "estimate_variance",
+            "edge_weight",
+        ),
         *("atrous_level", "atrous_filter", "luminance", "tonemap"),
         *("preset", "load_params", "save_params"),
         *("open_source", "read_frame", "load_sequence", "load_reference", "read_radiance", "sample"),

@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"types"},
     {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check"},
-    {"edges", "exr", "sanitation", "accumulation", "reprojection", "sequences", "cameras"},
+    {"edges", "exr", "sanitation", "accumulation", "reprojection", "modulation", "sequences", "cameras"},
     {"variance", "atrous", "adaptation", "roles", "preview"},
     {"frames", "references", "pipeline", "checkpoint"},
     {"compiled", "comparison", "outputs", "plan"},
