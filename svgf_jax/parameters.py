@@ -33,6 +33,10 @@ PRESETS: dict[str, tuple[Params, Config]] = {
         Params(alpha=0.05, sigma_luminance=10.0, short_history_boost=4.0),
         Config(levels=4, feedback_level=1),
     ),
+    "adaptive": (
+        Params(sigma_luminance=(8.0, 6.0, 4.0, 3.0, 2.0), short_history_boost=4.0),
+        Config(light_cell=4),
+    ),
 }
 
 # Where each number must lie: (least, most), open ends excluded.
@@ -52,15 +56,22 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "reproject_normal": (-1.0, 1.0),
     "kernel_near": _POSITIVE,
     "kernel_far": _POSITIVE,
+    "light_gain_threshold": _POSITIVE,
+    "light_offset_threshold": _POSITIVE,
+    "light_sigma_normal": _POSITIVE,
 }
 _MAX_LEVELS = 12
 
 
 def preset(name: str) -> tuple[Params, Config]:
-    """The parameters and choices of a preset: `paper` (Schied et al. 2017) or `falcor` (NVIDIA Falcor's SVGFPass)."""
+    """The parameters and choices of a preset: `paper` (Schied et al. 2017), `falcor` (NVIDIA Falcor's SVGFPass), or
+    `adaptive`, which follows changes of the light.
+    """
     if name not in PRESETS:
         raise SvgfError(f"no preset {name!r}; there are {', '.join(PRESETS)}{_suggest(name, PRESETS)}")
-    return PRESETS[name]
+    params, config = PRESETS[name]
+    per_level = {key: _per_level(list(value)) for key, value in params._asdict().items() if isinstance(value, tuple)}
+    return params._replace(**per_level), config
 
 
 def load_params(path: str | os.PathLike[str]) -> tuple[Params, Config]:
@@ -135,7 +146,7 @@ def override(params: Params, config: Config, values: Mapping[str, Any]) -> tuple
 
 
 def _choice(name: str, value: Any) -> int:
-    least = {"levels": 0, "feedback_level": -1}[name]
+    least = {"levels": 0, "feedback_level": -1, "light_cell": 0}[name]
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= _MAX_LEVELS:
         raise SvgfError(f"{name} = {value!r}; wanted a whole number from {least} to {_MAX_LEVELS}")
     return value

@@ -141,6 +141,10 @@ class Params(NamedTuple):
         reproject_normal: smallest cosine between the normals of consistent pixels, in [-1, 1).
         kernel_near: a-trous tap at distance 1 relative to the centre tap (B3 spline: 2/3), > 0.
         kernel_far: a-trous tap at distance 2 relative to the centre tap (B3 spline: 1/6), > 0.
+        light_gain_threshold: standard errors by which the light over a wide neighbourhood must differ from the history's
+            before the history is scaled to it, > 0. This and the next two are read only where `light_cell` > 0.
+        light_offset_threshold: the same over a narrow neighbourhood, before the rest of the difference is added, > 0.
+        light_sigma_normal: normal edge-stopping of these neighbourhoods, exponent of the cosine, > 0.
     """
 
     alpha: Any = 0.2
@@ -157,6 +161,9 @@ class Params(NamedTuple):
     reproject_normal: Any = 0.9
     kernel_near: Any = 2 / 3
     kernel_far: Any = 1 / 6
+    light_gain_threshold: Any = 1.5
+    light_offset_threshold: Any = 2.0
+    light_sigma_normal: Any = 64.0
 
 
 class Config(NamedTuple):
@@ -166,10 +173,12 @@ class Config(NamedTuple):
         levels: number of a-trous levels, >= 0; level i has step size 2**i.
         feedback_level: the level whose output becomes the history illumination; -1 = the unfiltered accumulation.
             Beyond the last level it is the last.
+        light_cell: follow changes of the light, judged over cells of this many pixels squared; 0 = do not.
     """
 
     levels: int = 5
     feedback_level: int = 0
+    light_cell: int = 0
 
 
 def at_level(params: Params, level: int) -> Params:

@@ -1,0 +1,336 @@
+"""Following the light: correct the reprojected history where the illumination has changed, judged from the frames alone.
+
+Reprojection sees geometry only; when a lamp flickers or a shadow moves, the history shows light that is gone. A pixel's own
+sample can't tell: at one sample a pixel the noise is larger than the change. The mean over a neighbourhood on the same surface can.
+So the frame I and its reprojected history H are compared as means over *cells* of light_cell x light_cell pixels, pooled further by
+a-trous levels on the grid of cells, with the geometry weights w_z w_n and no luminance weight (noise averages out, change does not).
+The history is then corrected rather than shortened: it keeps its detail and its low noise, and takes on the new light at once.
+
+1. *Gain*, for lamps: over a wide neighbourhood, g = 1 + s (mean I / mean H - 1), per color channel.
+2. *Offset*, for shadows: what is left, over a narrow neighbourhood, o = s (mean I - g mean H).
+
+s in [0, 1) is how significant the difference d of the mean luminances is against its own standard error e:
+s = max(0, 1 - (threshold e / d)^2), where e^2 is the variance of the samples' differences inside the neighbourhood over the effective
+number of them. A single firefly in a neighbourhood of n pixels makes d and e equally large, so it is never significant.
+
+Then, per pixel, from the four cells around it (bilinear, geometry weights): H' = max(0, g H + o), and the moments move with it:
+M1' = g M1 + o; the variance M2 - M1^2 scales with the square of the light and turns, as s rises, into the one just observed around.
+Nothing here is in Schied et al. 2017; the gradient's normalisation is that of A-SVGF (Schied et al. 2018) in other clothes.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from svgf_jax.color import luminance_of_planes
+from svgf_jax.edges import Guides, depth_gradient, geometry_exponent, guides_of
+from svgf_jax.sampling import planes, square_offsets, sum_over_taps
+from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
+
+GAIN_LEVELS = 2  # a-trous levels on the grid of cells: reach of +-6 cells
+OFFSET_LEVELS = 1  # +-2 cells
+LARGEST_GAIN = 50.0
+_OFFSETS = square_offsets(2)
+_DARK = 1e-6  # mean luminance below which a ratio means nothing
+_TINY = 1e-12
+
+Color = tuple[Array, Array, Array]
+
+
+class Cells(NamedTuple):
+    """What is known of the cells, planes `[h, w]`; a cell's guides are those of its central pixel.
+
+    Attributes:
+        guides, slope: of the central pixels.
+        weight: sum of the weights w of the cell's pixels that have history; 0 = nothing known.
+        square: sum of w^2.
+    """
+
+    guides: Guides
+    slope: tuple[Array, Array]
+    weight: Array
+    square: Array
+
+
+class Means(NamedTuple):
+    """Weighted means over the pixels of a cell, of one signal.
+
+    Attributes:
+        current, previous: color of this frame and of the history.
+        current2, product, previous2: means of l^2, l prev_l and prev_l^2, for the luminances l and prev_l.
+    """
+
+    current: Color
+    previous: Color
+    current2: Array
+    product: Array
+    previous2: Array
+
+
+class Correction(NamedTuple):
+    """What a cell says about its surroundings, of one signal.
+
+    Attributes:
+        gain, offset: per color channel: H' = gain H + offset.
+        luminance_gain: the gain on the first moment.
+        keep, variance: new variance = keep * old one + variance.
+    """
+
+    gain: Color
+    offset: Color
+    luminance_gain: Array
+    keep: Array
+    variance: Array
+
+
+def follow_light(
+    previous: Reprojected, illumination: Array, frame: Frame, *, params: Params, config: Config
+) -> Reprojected:
+    """The reprojected history, its illumination and moments corrected to this frame's light.
+
+    Args:
+        previous: the reprojected history.
+        illumination: `[S, H, W, 3]`, this frame's demodulated radiance.
+        frame: sanitised; its normal, depth and object_id guide the comparison.
+        params: per-level leaves are read at entry 0.
+        config: `light_cell` = 0 leaves the history as it is.
+
+    Returns:
+        `previous` with other illumination and moments; pixels without history, and those unlike any cell near, are unchanged.
+    """
+    size = config.light_cell
+    if size == 0:
+        return previous
+    scalars = at_level(params, 0)
+    height, width = frame.depth.shape
+    split = lambda tree: jax.tree.map(lambda plane: _phases(plane, size), tree)  # noqa: E731
+    guides = split(guides_of(frame))
+    slope = split(depth_gradient(frame.depth, frame.object_id))
+    known = split(previous.valid.astype(frame.depth.dtype))
+    current = tuple(split(planes(signal)) for signal in illumination)
+    history = tuple(split(planes(signal)) for signal in previous.illumination)
+    moments = tuple(split(planes(signal)) for signal in previous.moments)
+
+    cells, means = _gather(guides, slope, known, current, history, size=size, scalars=scalars)
+    corrections = _judge(cells, means, size=size, scalars=scalars)
+    history, moments = _apply(cells, corrections, guides, slope, known, history, moments, size=size, scalars=scalars)
+    join = lambda phases: _unphase(phases, size, height, width)  # noqa: E731
+    return previous._replace(
+        illumination=jnp.stack([jnp.stack([join(c) for c in signal], axis=-1) for signal in history]),
+        moments=jnp.stack([jnp.stack([join(m) for m in signal], axis=-1) for signal in moments]),
+    )
+
+
+def _phases(plane: Array, size: int) -> Array:
+    """`[H, W]` -> `[size^2, h, w]`: entry a * size + b holds pixel (a, b) of every cell; 0 beyond the image."""
+    height, width = plane.shape
+    padded = jnp.pad(plane, ((0, -height % size), (0, -width % size)))
+    rows, columns = padded.shape[0] // size, padded.shape[1] // size
+    return padded.reshape(rows, size, columns, size).transpose(1, 3, 0, 2).reshape(size * size, rows, columns)
+
+
+def _unphase(phases: Array, size: int, height: int, width: int) -> Array:
+    _, rows, columns = phases.shape
+    plane = phases.reshape(size, size, rows, columns).transpose(2, 0, 3, 1)
+    return plane.reshape(rows * size, columns * size)[:height, :width]
+
+
+def _from_centre(size: int) -> np.ndarray:
+    """Offsets (dy, dx) of a cell's pixels from its central one, `[size^2, 2]`, in the order of `_phases`."""
+    reach = np.arange(size) - size // 2
+    return np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _weight(p: Guides, q: Guides, slope: tuple[Array, Array], dy: Array, dx: Array, scalars: Params) -> Array:
+    exponent = geometry_exponent(
+        p,
+        q,
+        slope[0] * dx + slope[1] * dy,
+        sigma_depth=scalars.sigma_depth,
+        sigma_normal=scalars.light_sigma_normal,
+        depth_epsilon=scalars.depth_epsilon,
+    )
+    return p.surface * q.surface * jnp.exp(exponent)
+
+
+def _gather(guides, slope, known, current, history, *, size: int, scalars: Params) -> tuple[Cells, tuple[Means, ...]]:
+    """Means over the cells' own pixels, weighted by likeness to the central one."""
+    centre = (size // 2) * (size + 1)
+    cell_guides, cell_slope = jax.tree.map(lambda a: a[centre], (guides, slope))
+    distance = jnp.asarray(_from_centre(size), known.dtype)
+
+    def add(sums, phase):
+        q, with_history, colors, (dy, dx) = phase
+        weight = with_history * _weight(cell_guides, q, cell_slope, dy, dx, scalars)
+        weights, squares, totals = sums
+        values = tuple(_moments_of(*pair) for pair in colors)
+        totals = jax.tree.map(lambda total, value: total + weight * value, totals, values)
+        return (weights + weight, squares + weight * weight, totals), None
+
+    colors = tuple(zip(current, history, strict=True))
+    zero = jnp.zeros(known.shape[1:], known.dtype)
+    nothing = tuple(Means((zero,) * 3, (zero,) * 3, zero, zero, zero) for _ in colors)
+    (weight, square, totals), _ = lax.scan(
+        jax.checkpoint(add, prevent_cse=False),  # type: ignore[arg-type]
+        (zero, zero, nothing),
+        (guides, known, colors, (distance[:, 0], distance[:, 1])),
+    )
+    divisor = jnp.where(weight > _TINY, weight, 1.0)
+    return Cells(cell_guides, cell_slope, weight, square), jax.tree.map(lambda total: total / divisor, totals)
+
+
+def _moments_of(current: Color, history: Color) -> Means:
+    l, prev_l = luminance_of_planes(*current), luminance_of_planes(*history)  # noqa: E741
+    return Means(current, history, l * l, l * prev_l, prev_l * prev_l)
+
+
+def _judge(cells: Cells, means: tuple[Means, ...], *, size: int, scalars: Params) -> tuple[Correction, ...]:
+    """Steps 1 and 2 of the module's docstring, on the grid of cells."""
+    ones, zeros = jnp.ones_like(cells.weight), jnp.zeros_like(cells.weight)
+    start = tuple(Correction((ones,) * 3, (zeros,) * 3, ones, ones, zeros) for _ in means)
+    wide, effective = _pool(cells, _compared(means, start), levels=GAIN_LEVELS, size=size, scalars=scalars)
+    with_gain = []
+    for current, previous, square in wide:
+        significance, _ = _significance(current, previous, square, effective, scalars.light_gain_threshold)
+        scale = luminance_of_planes(*previous)
+        luminance_gain = _ratio(luminance_of_planes(*current), scale, scale, significance)
+        gain = tuple(_ratio(c, p, scale, significance) for c, p in zip(current, previous, strict=True))
+        keep = (1.0 - significance) * luminance_gain**2
+        with_gain.append(Correction(gain, (zeros,) * 3, luminance_gain, keep, significance))
+    narrow, effective = _pool(cells, _compared(means, with_gain), levels=OFFSET_LEVELS, size=size, scalars=scalars)
+    return tuple(
+        _with_offset(before, *pooled, effective, scalars.light_offset_threshold)
+        for before, pooled in zip(with_gain, narrow, strict=True)
+    )
+
+
+def _with_offset(before: Correction, current: Color, previous: Color, square: Array, effective: Array, threshold):
+    significance, observed = _significance(current, previous, square, effective, threshold)
+    offset = tuple(significance * (c - p) for c, p in zip(current, previous, strict=True))
+    either = 1.0 - (1.0 - before.variance) * (1.0 - significance)  # until here `variance` held the gain's significance
+    scale = luminance_of_planes(*previous)
+    grown = _ratio(luminance_of_planes(*current), scale, scale, significance)
+    keep = before.keep * (1.0 - significance) * grown**2
+    return before._replace(offset=offset, keep=keep, variance=either * observed)
+
+
+def _compared(means: tuple[Means, ...], corrections) -> tuple:
+    """Per signal: the cells' current and corrected previous color, and the mean square of their luminances' difference."""
+    out = []
+    for mean, c in zip(means, corrections, strict=True):
+        previous = tuple(g * p for g, p in zip(c.gain, mean.previous, strict=True))
+        square = mean.current2 - 2.0 * c.luminance_gain * mean.product + c.luminance_gain**2 * mean.previous2
+        out.append((mean.current, previous, jnp.maximum(square, 0.0)))
+    return tuple(out)
+
+
+def _pool(cells: Cells, values, *, levels: int, size: int, scalars: Params) -> tuple:
+    """Means of `values` over ever wider neighbourhoods of cells, and 1 / (effective number of pixels) of these means."""
+    totals = jax.tree.map(lambda value: value * cells.weight, values)
+    state = (cells.weight, cells.square, totals)
+    kernel = np.outer([1, 4, 6, 4, 1], [1, 4, 6, 4, 1]).reshape(-1) / 256.0
+    for level in range(levels):
+        offsets = _OFFSETS * 2**level
+        distance = jnp.asarray(offsets * size, cells.weight.dtype)
+
+        def tap(sums, q, p, t):
+            dy, dx, h = t
+            weight = h * _weight(p["guides"], q["guides"], p["slope"], dy, dx, scalars)
+            weights, squares, totals = q["state"]
+            return (
+                sums[0] + weight * weights,
+                sums[1] + weight * weight * squares,
+                jax.tree.map(lambda s, v: s + weight * v, sums[2], totals),
+            )
+
+        state = sum_over_taps(
+            tap,
+            lambda sums, p: sums,
+            neighbours={"guides": cells.guides, "state": state},
+            centre={"guides": cells.guides, "slope": cells.slope},
+            offsets=offsets,
+            per_tap=(distance[:, 0], distance[:, 1], jnp.asarray(kernel, cells.weight.dtype)),
+            sums=jax.tree.map(lambda a: jnp.zeros((), a.dtype), state),
+        )
+    weight, square, totals = state
+    some = weight > _TINY
+    divisor = jnp.where(some, weight, 1.0)
+    return jax.tree.map(lambda t: t / divisor, totals), jnp.where(some, square / divisor / divisor, 1.0)
+
+
+def _significance(current: Color, previous: Color, square: Array, effective: Array, threshold) -> tuple[Array, Array]:
+    """s of the module's docstring, and the variance of the samples' luminance."""
+    difference = luminance_of_planes(*current) - luminance_of_planes(*previous)
+    change = difference * difference
+    variance = jnp.maximum(square - change, 0.0)
+    noise = threshold * threshold * effective * variance
+    significant = change > noise + _TINY  # inside, the quotient and its derivative are bounded
+    return jnp.where(significant, 1.0 - noise / jnp.where(significant, change, 1.0), 0.0), variance
+
+
+def _ratio(current: Array, previous: Array, scale: Array, significance: Array) -> Array:
+    """1 + s (current / previous - 1), steadied by 1 % of the luminance `scale` and limited; 1 in the dark."""
+    steady = 0.01 * scale
+    lit = scale > _DARK
+    ratio = (current + steady) / jnp.where(lit, previous + steady, 1.0)
+    return 1.0 + jnp.where(lit, significance * (jnp.clip(ratio, 1.0 / LARGEST_GAIN, LARGEST_GAIN) - 1.0), 0.0)
+
+
+def _apply(cells: Cells, corrections, guides, slope, known, history, moments, *, size: int, scalars: Params):
+    """Bring the corrections to the pixels, from the 2 x 2 cells whose central pixels surround each."""
+    _, rows, columns = known.shape
+    offset = _from_centre(size)
+    first = np.where(offset < 0, -1, 0)  # of the two cells along an axis, relative to the pixel's own
+    fraction = offset / size - first
+    corners = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+    cell = first[:, None] + corners  # [size^2, 4, 2]
+    share = np.where(corners == 1, fraction[:, None], 1.0 - fraction[:, None]).prod(axis=-1)
+    distance = jnp.asarray(cell * size - offset[:, None], known.dtype)
+    around = (cells.guides, (cells.weight > _TINY).astype(known.dtype), corrections)
+    around = jax.tree.map(lambda plane: jnp.pad(plane, 1), around)
+
+    def pixel(phase):
+        p, p_slope, with_history, colors, pairs, corner, shares, away = phase
+
+        def add(sums, tap):
+            at, part, far = tap
+            q, knows, values = jax.tree.map(
+                lambda plane: lax.dynamic_slice(plane, (at[0], at[1]), (rows, columns)), around
+            )
+            weight = part * knows * _weight(p, q, p_slope, far[0], far[1], scalars)
+            return (sums[0] + weight, jax.tree.map(lambda s, v: s + weight * v, sums[1], values)), None
+
+        zero = jnp.zeros((rows, columns), known.dtype)
+        sums = (zero, jax.tree.map(lambda _: zero, corrections))
+        (weight, totals), _ = lax.scan(add, sums, (corner, shares, away))
+        found = (weight > 1e-8) & (with_history > 0.0)
+        divisor = jnp.where(found, weight, 1.0)
+        corrected = [_correct(c, m, t, divisor) for c, m, t in zip(colors, pairs, totals, strict=True)]
+        return jax.tree.map(lambda new, old: jnp.where(found, new, old), tuple(corrected), tuple(zip(colors, pairs)))
+
+    result = lax.map(
+        jax.checkpoint(pixel, prevent_cse=False),  # type: ignore[arg-type]
+        (
+            guides,
+            slope,
+            known,
+            history,
+            moments,
+            jnp.asarray(cell + 1, jnp.int32),
+            jnp.asarray(share, known.dtype),
+            distance,
+        ),
+    )
+    return tuple(color for color, _ in result), tuple(pair for _, pair in result)
+
+
+def _correct(color: Color, moments: tuple[Array, Array], total: Correction, divisor: Array):
+    c = jax.tree.map(lambda t: t / divisor, total)
+    corrected = tuple(jnp.maximum(g * h + o, 0.0) for g, h, o in zip(c.gain, color, c.offset, strict=True))
+    first, second = moments
+    variance = c.keep * jnp.maximum(second - first * first, 0.0) + c.variance
+    first = jnp.maximum(c.luminance_gain * first + luminance_of_planes(*c.offset), 0.0)
+    return corrected, (first, variance + first * first)
