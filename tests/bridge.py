@@ -32,7 +32,8 @@ def to_history(history, dtype=np.float64) -> History:
 
 
 def to_params(params, dtype=np.float64) -> Params:
-    return Params(**{k: np.asarray(v, dtype) for k, v in params.items()})
+    """All as arrays of one type; what the oracle does not know keeps its default."""
+    return Params(**{k: np.asarray(v, dtype) for k, v in (Params()._asdict() | params).items()})
 
 
 def to_config(config) -> Config:
