@@ -56,8 +56,8 @@ def load(path: Path, fresh: Descent, identity: dict[str, Any]) -> Progress:
     Raises SvgfError: not there, damaged, or of another fit than `identity`.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            content = {name: file[name] for name in file.files}
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            content = {name: stored[name] for name in stored.files}
         header = json.loads(str(content["header"]))
         if header["format"] != FORMAT:
             raise SvgfError(f"{path}: written by another version; start anew without --resume")

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from svgf_jax import Config, Frame, Params, init, step
+from svgf_jax import Config, Params, init, step
 from svgf_jax.metrics import Scores, mean_scores, score
 from svgf_jax.threads import read_ahead
 from tune.shots import Shot
@@ -41,8 +41,7 @@ def filtered(shot: Shot, params: Params, config: Config) -> Iterator[tuple[np.nd
     history = None
     with closing(read_ahead(shot.read, range(shot.length), threads=1)) as examples:
         for frame, target in examples:
-            frame = Frame(*frame)
-            leaves = Params(*(np.asarray(leaf, np.asarray(frame.depth).dtype) for leaf in params))
+            leaves = Params(*(np.asarray(leaf, frame.depth.dtype) for leaf in params))
             history, output = run(init(frame) if history is None else history, frame, params=leaves)
             yield np.asarray(output.image), target
 

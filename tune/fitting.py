@@ -13,6 +13,7 @@ from tune.residuals import REFERENCE, Term
 from tune.shots import Shot
 from tune.sweep import Problem, Sweep, pose, sweep
 
+_INTERRUPTED = "interrupted; this is the best so far"
 PATIENCE = 6  # trial points rejected in a row: the loss has nothing left that its derivatives know of
 
 
@@ -107,7 +108,6 @@ def fit(
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
     save: Callable[[Progress], None] = lambda progress: None,
     resume: Callable[[solvers.Descent], Progress] | None = None,
-    stop: Callable[[], bool] = lambda: False,
 ) -> Fit:
     """Find the numbers of the filter that make its images most like the shots' targets.
 
@@ -124,7 +124,8 @@ def fit(
         balance: each shot counts alike, whatever its error at the start.
         on_iteration: hears of each trial point.
         save: hears of each state in which the fit could go on later; `resume`: given a fresh descent, such a state.
-        stop: asked after each trial point; True ends the fit with the best so far.
+
+    A KeyboardInterrupt ends the fit with the best so far, once there is one.
 
     Raises:
         SvgfError: nothing to tune, frames that cannot be read, an error that cannot be lowered because it is not a number.
@@ -142,7 +143,11 @@ def fit(
     endings: dict[int, str] = {}
     while progress.start < max(starts, 1):
         if progress.ended is None:
-            progress = _iterate(problem, progress, max_steps=max_steps, least_gain=least_gain)
+            try:
+                progress = _iterate(problem, progress, max_steps=max_steps, least_gain=least_gain)
+            except KeyboardInterrupt:
+                endings = dict.fromkeys(range(progress.start + 1), _INTERRUPTED)
+                break
             on_iteration(progress.iterations[-1])
         if progress.ended is not None:
             endings[progress.start] = progress.ended
@@ -151,9 +156,6 @@ def fit(
                 start=progress.start + 1, descent=solvers.begin(chosen, y_next), loss=np.inf, ended=None
             )
         save(progress)
-        if stop() and progress.start < max(starts, 1):
-            endings[progress.start] = "interrupted; this is the best so far"
-            break
     return _conclude(problem, progress, endings, shots)
 
 
@@ -172,16 +174,16 @@ def _iterate(problem: Problem, progress: Progress, *, max_steps: int, least_gain
         result = sweep(problem, y, linear=True, bound=bound)
     if not np.isfinite(result.loss):
         result = _failed(n)
-    known = result.complete and result.triangle is not None
-    descent, accepted = solvers.advance(descent, result.triangle if known else solvers.rejected(result.loss, n))
+    triangle = result.triangle if result.complete else None
+    descent, accepted = solvers.advance(descent, solvers.rejected(result.loss, n) if triangle is None else triangle)
     loss = result.loss if accepted else progress.loss
     iteration = Iteration(
         progress.start, len(mine), result.loss, accepted, natural(y, problem.coordinates), descent.damping
     )
     ended = _ending(iteration, descent, progress.loss, mine, max_steps=max_steps, least_gain=least_gain)
     best_y, best_loss, found = progress.best_y, progress.best_loss, progress.found
-    if known and result.loss < best_loss:
-        best_y, best_loss, found = y, result.loss, (result.triangle, result.scatter, result.rows)
+    if triangle is not None and result.scatter is not None and result.loss < best_loss:
+        best_y, best_loss, found = y, result.loss, (triangle, result.scatter, result.rows)
     iterations = (*progress.iterations, iteration)
     return progress._replace(
         descent=descent, iterations=iterations, loss=loss, best_y=best_y, best_loss=best_loss, found=found, ended=ended
@@ -227,7 +229,9 @@ def _scattered(y_start: np.ndarray, seed: int, start: int) -> np.ndarray:
 def _conclude(problem: Problem, progress: Progress, endings: dict[int, str], shots: Sequence[Shot]) -> Fit:
     coordinates = problem.coordinates
     if progress.found is None:
-        raise SvgfError("the fit ended before anything was known; nothing has been written")
+        if _INTERRUPTED in endings.values():
+            raise KeyboardInterrupt
+        raise SvgfError(f"the fit came to nothing: {endings.get(0, 'no trial point could be computed')}")
     accepted = [i for i in progress.iterations if i.accepted and i.loss == progress.best_loss]
     best_start = accepted[0].start if accepted else 0
     result = endings.get(best_start, "resumed after its end; this is the best so far")

@@ -23,7 +23,7 @@ def factor_blocks(rows: np.ndarray, *, block_rows: int = BLOCK_ROWS) -> np.ndarr
 def combine(factors: np.ndarray) -> np.ndarray:
     """The factor `[c, c]` of all the rows behind `factors` `[blocks, c, c]`, with a diagonal >= 0: it is then unique."""
     columns = factors.shape[-1]
-    triangle = np.linalg.qr(factors.reshape(-1, columns), mode="r")
+    triangle = np.asarray(np.linalg.qr(factors.reshape(-1, columns), mode="r"))
     return triangle * np.where(np.diag(triangle) < 0, -1.0, 1.0)[:, None]
 
 
@@ -35,8 +35,8 @@ def fold(triangle: np.ndarray, rows: np.ndarray, *, block_rows: int = BLOCK_ROWS
 def _factor(block: np.ndarray) -> np.ndarray:
     """The triangular factor `[c, c]` of a block, to Householder's accuracy but in matrix products, where LAPACK crawls.
 
-    CholeskyQR2 (Yamamoto et al. 2015): A'A = R1'R1, Q = A / R1, Q'Q = R2'R2, R = R2 R1. The second pass restores the digits that the
-    first one lost, unless the columns are nearly dependent: then it is Householder's QR after all.
+    CholeskyQR2 (Yamamoto et al. 2015): A'A = R1'R1, Q = A / R1, Q'Q = R2'R2, R = R2 R1. The second pass restores the digits that
+    the first one lost, unless the columns are nearly dependent: then it is Householder's QR after all.
     """
     columns = block.shape[1]
     size = np.sqrt(np.einsum("ij,ij->j", block, block))
@@ -53,6 +53,6 @@ def _factor(block: np.ndarray) -> np.ndarray:
         factor = np.linalg.cholesky(quotient.T @ quotient).T @ first
     except np.linalg.LinAlgError:
         padded = np.concatenate([scaled, np.zeros((max(present.size - len(scaled), 0), present.size))])
-        factor = np.linalg.qr(padded, mode="r")
+        factor = np.asarray(np.linalg.qr(padded, mode="r"))
     triangle[np.ix_(present, present)] = factor * size[present]
     return triangle

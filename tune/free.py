@@ -129,10 +129,10 @@ def to_free(params: Params, coordinates: Coordinates) -> np.ndarray:
     return np.array([_forward(e.name, float(_entry(getattr(params, e.name), e.level))) for e in coordinates.free])
 
 
-def from_free(y: Array, coordinates: Coordinates) -> Params:
-    """The parameters at free coordinates `[n]`, differentiable; in the dtype of `y`."""
-    leaves: dict[str, Any] = {name: jnp.asarray(value, y.dtype) for name, value in coordinates.start._asdict().items()}
-    for i, e in enumerate(coordinates.free):
+def from_free(y: Array, start: Params, free: tuple[Free, ...]) -> Params:
+    """`start` with the numbers `free` at the coordinates `y` `[n]`, differentiable; in the dtype of `y`."""
+    leaves: dict[str, Any] = {name: jnp.asarray(value, y.dtype) for name, value in start._asdict().items()}
+    for i, e in enumerate(free):
         value = _inverse(e.name, y[i])
         leaves[e.name] = value if e.level is None else leaves[e.name].at[e.level].set(value)
     return Params(**leaves)

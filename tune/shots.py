@@ -42,7 +42,8 @@ def shot_of_arrays(frames: Frame, targets: Any, *, name: str = "frames") -> Shot
         )
 
     def read(index: int) -> Example:
-        return Example(Frame(*(np.asarray(leaf[index]) for leaf in frames)), targets[index])
+        leaves: list[Any] = [np.asarray(leaf[index]) for leaf in frames]
+        return Example(Frame(*leaves), targets[index])
 
     return Shot(name, targets.shape[0], read)
 
@@ -108,7 +109,7 @@ def window(shot: Shot, *, rows: slice = slice(None), columns: slice = slice(None
     def read(index: int) -> Example:
         frame, target = shot.read(indices[index])
         axes = {"depth": 0, "prev_depth": 0, "object_id": 0, "radiance": 1, "albedo": 1}
-        cut = {
+        cut: dict[str, Any] = {
             name: np.ascontiguousarray(leaf[(slice(None),) * (axes.get(name) == 1) + (rows, columns)])
             for name, leaf in frame._asdict().items()
         }

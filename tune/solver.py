@@ -25,8 +25,8 @@ SCALE = 1e3
 class Point(NamedTuple):
     """The folded residual `[n + 1]` at a point and its Jacobian `[n + 1, n]`."""
 
-    residual: np.ndarray
-    jacobian: np.ndarray
+    residual: Any
+    jacobian: Any
 
 
 class Descent(NamedTuple):

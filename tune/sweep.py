@@ -3,22 +3,22 @@
 Memory is that of a frame: frames are read ahead, differentiated and folded away one after the other.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svgf_jax import SvgfError
+from svgf_jax import Params, SvgfError
 from svgf_jax.threads import read_ahead
 from tune.fold import combine, factor_blocks
 from tune.free import GATES, Coordinates
 from tune.residuals import Term
 from tune.shots import Example, Shot
-from tune.tangents import Carry, FramePass, Given, compile_pass, no_tangents
+from tune.tangents import Carry, FramePass, Given, Smooth, compile_pass, no_tangents
 
 GATE_STEP = 0.25
 """Half the step, in free coordinates, across which the derivative in a threshold is taken."""
@@ -85,7 +85,7 @@ def pose(
     terms = tuple(term for term in terms if term.weight > 0)
     if not any(term.pixels for term in terms):
         raise SvgfError("got no residual that looks at pixels; wanted at least one with a weight above 0")
-    frame_pass = compile_pass(coordinates, terms, y_start)
+    frame_pass = compile_pass(coordinates.free, coordinates.config, terms)
     problem = Problem(coordinates, y_start, terms, tuple(shots), np.ones(len(shots)), max(1, tangent_batch), frame_pass)
     # The others are 0 at the start: the prior by definition.
     losses = sweep(problem, y_start, linear=False).shot_losses * len(shots)
@@ -108,7 +108,7 @@ def sweep(problem: Problem, y: np.ndarray, *, linear: bool, bound: float = np.in
     with ThreadPoolExecutor(1, thread_name_prefix="svgf-fold") as folding:
         for i, shot in enumerate(problem.shots):
             before: Future | None = None
-            with closing(_frames(problem, i, shot, y, linear)) as blocks:
+            with closing(frame_blocks(problem, i, shot, y, linear)) as blocks:
                 for block in blocks:
                     if before is not None:
                         losses[i] += _take(before, triangle, scatter)
@@ -146,7 +146,7 @@ def _take(future: Future, triangle: np.ndarray, scatter: np.ndarray) -> float:
     return loss
 
 
-def _frames(problem: Problem, index: int, shot: Shot, y: np.ndarray, linear: bool) -> Iterator[tuple]:
+def frame_blocks(problem: Problem, index: int, shot: Shot, y: np.ndarray, linear: bool) -> Generator[tuple, None, None]:
     """(residual, columns) of each frame of a shot: `[m]`, and a list of `[k, m]` that together are `[n, m]`."""
     run, coordinates = problem.frame_pass, problem.coordinates
     n = len(coordinates.free)
@@ -155,8 +155,11 @@ def _frames(problem: Problem, index: int, shot: Shot, y: np.ndarray, linear: boo
     smooth_ones = [i for i in range(n) if i not in gates] if linear else []
     with closing(read_ahead(shot.read, range(shot.length), threads=1)) as examples:
         carry: Carry | None = None
+        pilot: Any = None
+        batches: list[tuple[Any, Smooth, list[int]]] = []
+        sides: dict[int, tuple[Carry, Carry]] = {}
         for example in examples:
-            given = _given(example, shot, problem.pixel_weights[index], len(problem.shots))
+            given = _given(example, shot, problem, index)
             dtype = given.frame.radiance.dtype
             at = jnp.asarray(y, dtype)
             if carry is None:
@@ -168,8 +171,9 @@ def _frames(problem: Problem, index: int, shot: Shot, y: np.ndarray, linear: boo
             if piloted:
                 pilot, _ = run.plain(jnp.asarray(problem.y_start, dtype), pilot, given)
                 given = given._replace(pilot=pilot.before.image)
-            last, columns = carry, np.empty(n, object)
-            residual = None
+            last = carry
+            residual: Any = None
+            columns: list[Any] = [None] * n
             for b, (directions, tangents, used) in enumerate(batches):
                 carry, tangents, residual, change = run.linear(at, directions, last, tangents, given)
                 batches[b] = (directions, tangents, used)
@@ -185,7 +189,7 @@ def _frames(problem: Problem, index: int, shot: Shot, y: np.ndarray, linear: boo
                 down, below = run.plain(at - shift, sides[i][1], given)
                 sides[i] = (up, down)
                 columns[i] = ((above - below) / jnp.asarray(2 * GATE_STEP, dtype))[None]
-            yield residual, list(columns) if linear else []
+            yield residual, columns if linear else []
 
 
 def _groups(smooth_ones: list[int], n: int, batch: int) -> list[tuple[np.ndarray, list[int]]]:
@@ -203,15 +207,24 @@ def _groups(smooth_ones: list[int], n: int, batch: int) -> list[tuple[np.ndarray
     return groups
 
 
-def _given(example: Example, shot: Shot, pixel_weight: float, shots: int) -> Given:
+def _given(example: Example, shot: Shot, problem: Problem, index: int) -> Given:
     """The frame with its target; pixels of the target that are not finite are not known."""
     frame = example.frame
-    dtype = np.asarray(frame.radiance).dtype
-    share = 1 / (shots * shot.length)
+    dtype = np.dtype(frame.radiance.dtype)
+    share = 1 / (len(problem.shots) * shot.length)
     if example.target is None:
         target, known = np.zeros(frame.emission.shape, dtype), np.zeros(frame.depth.shape, dtype)
     else:
-        finite = np.isfinite(example.target).all(-1)
-        target = np.where(finite[..., None], example.target, 0).astype(dtype)
-        known = finite.astype(dtype)
-    return Given(frame, target, known, target, np.asarray(share * pixel_weight, dtype), np.asarray(share, dtype))
+        finite = np.all(np.isfinite(example.target), axis=-1)
+        target = np.where(np.isfinite(example.target), example.target, 0).astype(dtype)
+        known = np.asarray(finite, dtype)
+    return Given(
+        frame=frame,
+        target=target,
+        known=known,
+        pilot=target,
+        pixel_scale=np.asarray(share * problem.pixel_weights[index], dtype),
+        scale=np.asarray(share, dtype),
+        start=Params(*(np.asarray(leaf, dtype) for leaf in problem.coordinates.start)),
+        y_start=np.asarray(problem.y_start, dtype),
+    )

@@ -6,16 +6,15 @@ positions and other integers are constants of differentiation.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from svgf_jax import Frame, History, init, step
-from tune.free import Coordinates, from_free
+from svgf_jax import Config, Frame, History, Params, init, step
+from tune.free import Free, from_free
 from tune.residuals import Seen, Term
 
 
@@ -44,6 +43,8 @@ class Given(NamedTuple):
         pilot: as in `Seen`.
         pixel_scale: factor on the squares of the terms that look at pixels.
         scale: on those of the others.
+        start: what is not free keeps these values.
+        y_start: `[n]`, where the free coordinates started.
     """
 
     frame: Frame
@@ -52,6 +53,8 @@ class Given(NamedTuple):
     pilot: Any
     pixel_scale: Any
     scale: Any
+    start: Params
+    y_start: Any
 
 
 class FramePass(NamedTuple):
@@ -69,9 +72,10 @@ class FramePass(NamedTuple):
     linear: Callable[[Array, Array, Carry, Smooth, Given], tuple[Carry, Smooth, Array, Array]]
 
 
-def compile_pass(coordinates: Coordinates, terms: tuple[Term, ...], y_start: np.ndarray) -> FramePass:
-    """The functions that run one frame at free coordinates `y` `[n]`, residuals in the order of `terms`."""
-    one = partial(_one_frame, coordinates=coordinates, terms=terms, y_start=y_start)
+@cache
+def compile_pass(free: tuple[Free, ...], config: Config, terms: tuple[Term, ...]) -> FramePass:
+    """The functions that run one frame at free coordinates `y` `[n]`, residuals in the order of `terms`; compiled once."""
+    one = partial(_one_frame, free=free, config=config, terms=terms)
     return FramePass(start=jax.jit(_start), plain=jax.jit(partial(_plain, one)), linear=jax.jit(partial(_linear, one)))
 
 
@@ -96,18 +100,18 @@ def _one_frame(
     carry: Carry,
     given: Given,
     *,
-    coordinates: Coordinates,
+    free: tuple[Free, ...],
+    config: Config,
     terms: tuple[Term, ...],
-    y_start: np.ndarray,
 ) -> tuple[tuple[Smooth, Array], Carry]:
     """((what has derivatives, the residual), everything handed on)."""
     history = carry.history._replace(
         illumination=smooth.illumination, moments=smooth.moments, history_length=smooth.history_length
     )
     before = carry.before._replace(image=smooth.image)
-    history, output = step(history, given.frame, params=from_free(y, coordinates), config=coordinates.config)
+    history, output = step(history, given.frame, params=from_free(y, given.start, free), config=config)
     now = Seen(output.image, given.target, given.known, given.pilot)
-    away = y - jnp.asarray(y_start, y.dtype)
+    away = y - given.y_start
     pixels, others = [], []
     for term in terms:
         residual = term.residual(now, before, away)

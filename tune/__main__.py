@@ -1,0 +1,42 @@
+"""`python -m tune` and the `svgf-tune` command: which options there are, and what becomes of errors."""
+
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from cyclopts import App, CycloptsError
+
+from svgf_jax import SvgfError, __version__
+from tune.command import command
+
+app = App(
+    name="svgf-tune",
+    help="Fit the filter's numbers to a renderer's own noise.",
+    help_epilogue="The result: svgf-jax denoise INPUT -o FOLDER --params tuned.toml",
+    version=__version__,
+    help_format="plaintext",
+)
+app.default(command)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run and exit: 0; 1 if a validation sequence got worse; 2 for an error that its message explains; 130 interrupted."""
+    try:
+        code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+    except CycloptsError as error:
+        fail(f"{str(error).strip()} See `svgf-tune --help`.")
+    except SvgfError as error:
+        fail(str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def fail(message: str) -> NoReturn:
+    """Tell an error and exit with 2."""
+    print(f"svgf-tune: {message}", file=sys.stderr)
+    sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,270 @@
+"""`svgf-tune`: options in, a parameter file out. Nothing here imports JAX or NumPy at the top: help and errors answer at once."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Group, Parameter
+
+from svgf_jax import SvgfError
+from svgf_jax.commands import settings, terminal
+
+if TYPE_CHECKING:
+    from tune.fitting import Fit
+    from tune.shots import Shot
+
+Flag = Parameter(negative=(), show_default=False)
+Repeated = Parameter(negative=(), consume_multiple=True, show_default=False)
+INPUT, WHAT, HOW, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["Input", "What", "How", "Output"]))
+
+
+def command(
+    noisy: Annotated[tuple[str, ...], Parameter(name="NOISY", group=INPUT)],
+    /,
+    *,
+    out: Annotated[Path, Parameter(name=["--out", "-o"], metavar="FILE.toml", group=OUTPUT)],
+    reference: Annotated[tuple[str, ...], Repeated, Parameter(metavar="REF", group=INPUT)] = (),
+    second: Annotated[tuple[str, ...], Repeated, Parameter(metavar="NOISY2", group=INPUT)] = (),
+    validate: Annotated[tuple[str, ...], Repeated, Parameter(metavar="NOISY", group=INPUT)] = (),
+    validate_reference: Annotated[tuple[str, ...], Repeated, Parameter(metavar="REF", group=INPUT)] = (),
+    frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
+    validate_frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
+    channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = (),
+    file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = (),
+    cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto",
+    preset: Annotated[str | None, Parameter(metavar="NAME", group=WHAT)] = None,
+    params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=WHAT)] = None,
+    set_: Annotated[
+        tuple[str, ...], Parameter(name="--set", metavar="NAME=VALUE", negative=(), show_default=False, group=WHAT)
+    ] = (),
+    tune: Annotated[str | None, Parameter(metavar="NAMES", group=WHAT)] = None,
+    per_level: Annotated[str | None, Parameter(metavar="NAMES", group=WHAT)] = None,
+    freeze: Annotated[str | None, Parameter(metavar="NAMES", group=WHAT)] = None,
+    space: Annotated[Literal["reinhard", "log1p"], Parameter(group=HOW)] = "reinhard",
+    temporal: Annotated[float, Parameter(metavar="WEIGHT", group=HOW)] = 0.5,
+    prior: Annotated[float | None, Parameter(metavar="WEIGHT", group=HOW)] = None,
+    robust: Annotated[Literal["none", "huber", "geman-mcclure"], Parameter(group=HOW)] = "none",
+    robust_width: Annotated[float, Parameter(metavar="ERROR", group=HOW)] = 0.1,
+    solver: Annotated[Literal["lm", "dogleg", "gauss-newton"], Parameter(group=HOW)] = "lm",
+    max_steps: Annotated[int, Parameter(metavar="N", group=HOW)] = 30,
+    starts: Annotated[int, Parameter(metavar="N", group=HOW)] = 1,
+    seed: Annotated[int, Parameter(metavar="N", group=HOW)] = 0,
+    tangent_batch: Annotated[int, Parameter(metavar="N", group=HOW)] = 8,
+    resume: Annotated[bool, Flag, Parameter(group=HOW)] = False,
+    report: Annotated[Path | None, Parameter(metavar="FILE.html", group=OUTPUT)] = None,
+    maps: Annotated[Path | None, Parameter(metavar="FOLDER", group=OUTPUT)] = None,
+    profiles: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
+    flip: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
+    json: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
+    accept: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
+    overwrite: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
+) -> int:
+    """Find the filter's numbers that bring noisy sequences closest to their references, and write them to a file.
+
+    Args:
+        noisy: Sequences to tune on: folders, patterns or files as svgf-jax denoise takes them.
+        out: The parameter file.
+        reference: The references of the sequences, in the same order: folders (their ref_ sequence), patterns or files.
+        second: Instead of references: independent noisy renders of the same frames. References, if also given, only measure.
+        validate: Sequences that are measured, never tuned on.
+        validate_reference: Their references, in the same order.
+        frames: Only these frames of the sequences to tune on: 1-100, 1-100x2 or 1,3,5-9.
+        validate_frames: Only these frames of the sequences to validate on.
+        channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
+        file: The files of a role, for example normal=normal_####.exr. Repeatable.
+        cameras: The cameras.json of a sequence; auto takes the one beside the frames, none ignores it.
+        preset: The preset to start from; paper if neither it nor --params is given.
+        params: The parameter file to start from.
+        set_: One parameter of the start: sigma_normal=64. Repeatable.
+        tune: What to tune: names, or single levels (sigma_luminance[2]), with commas; all = every parameter.
+        per_level: Of these one number for each a-trous level; all = of all that have levels.
+        freeze: What not to tune after all.
+        space: In what the image error is taken: x / (1 + x), or log(1 + x).
+        temporal: Weight of the temporal error against the image error's 1.
+        prior: Weight of the distance from the start, in squared e-folds; 0.001, and 0.00001 with --second.
+        robust: Let single large errors count for less: their square grows linearly (huber) or levels off (geman-mcclure).
+        robust_width: From which error on.
+        solver: optimistix's Levenberg-Marquardt, Dogleg or Gauss-Newton.
+        max_steps: Trial points a start.
+        starts: Start from so many points, all but the first scattered about it, and keep the best.
+        seed: Of the scattered starts.
+        tangent_batch: Derivatives taken at a time: fewer need less memory and more time.
+        resume: Go on where an interrupted fit of the same options was.
+        report: Write a page with curves, tables and pictures.
+        maps: Write where in the image each number matters, as EXR.
+        profiles: Measure the error along each parameter by itself, and tell it with --json and --report.
+        flip: Measure HDR-FLIP too (slow; needs the extra `flip`).
+        json: Print the result as JSON to the standard output; all else goes to the standard error.
+        accept: Exit with 0 even if a validation sequence got worse.
+        overwrite: Replace outputs that exist.
+    """
+    name, start, config = settings.choose(preset, params, set_)
+    checkpoint = out.with_name(f".{out.name}.progress.npz")
+    _check(noisy, reference, second, validate, validate_reference, robust)
+    _check_apart(noisy, frames, validate, validate_frames)
+    for path in (out, report):
+        if path is not None and path.exists() and not (overwrite or resume):
+            raise SvgfError(f"{path} exists already; choose another name, or --overwrite.")
+        if path is not None and not path.absolute().parent.is_dir():
+            raise SvgfError(f"{path}: there is no folder {path.absolute().parent}; make it, or choose another name.")
+    roles = settings.assignments(channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
+    reading: dict[str, Any] = {
+        "channel": {role: names.split(",") for role, names in roles.items()},
+        "file": settings.assignments(file, option="--file", example="normal=normal_####.exr"),
+        "cameras": None if cameras == "none" else cameras,
+    }
+    if flip:
+        from svgf_jax.metrics import require_flip
+
+        require_flip()
+
+    import tune.checkpoint as checkpoints
+    from tune import residuals
+    from tune.fitting import fit
+    from tune.free import TUNED_BY_DEFAULT
+    from tune.shots import shot_of_files
+    from tune.telling import conclude, live
+
+    references = [shot_of_files(n, r, frames=frames, **reading) for n, r in zip(noisy, reference, strict=False)]
+    seconds = [
+        shot_of_files(n, s, frames=frames, prefer=("alt", "second", "noisy2"), **reading)
+        for n, s in zip(noisy, second, strict=False)
+    ]
+    held = [
+        shot_of_files(n, r, frames=validate_frames, **reading)
+        for n, r in zip(validate, validate_reference, strict=True)
+    ]
+    shots: list[Shot] = seconds or references
+    if second:
+        terms = residuals.noisy_terms(temporal=temporal, **({} if prior is None else {"prior_weight": prior}))
+    else:
+        weight = {} if prior is None else {"prior_weight": prior}
+        terms = residuals.reference_terms(space=space, temporal=temporal, robust=robust, width=robust_width, **weight)
+    names = _names(tune) or TUNED_BY_DEFAULT
+    levels: Any = True if per_level == "all" else _names(per_level)
+    identity = {
+        "sequences": noisy,
+        "reference": second or reference,
+        "frames": frames,
+        "start": name,
+        "numbers": [str(leaf) for leaf in start],
+        "tune": names,
+        "per_level": levels,
+        "freeze": _names(freeze),
+        "solver": solver,
+        "residuals": [space, temporal, prior, robust, robust_width],
+        "seed": seed,
+    }
+    terminal.warn(note for shot in (*shots, *held) for note in shot.notes)
+    with _terminated_as_interrupted(), live(len(shots), sum(shot.length for shot in shots)) as on_iteration:
+        found = fit(
+            start,
+            config,
+            shots,
+            terms,
+            names=names,
+            per_level=levels,
+            freeze=_names(freeze),
+            solver=solver,
+            max_steps=max_steps,
+            starts=starts,
+            seed=seed,
+            tangent_batch=tangent_batch,
+            on_iteration=on_iteration,
+            save=lambda progress: checkpoints.save(checkpoint, progress, identity),
+            resume=(lambda fresh: checkpoints.load(checkpoint, fresh, identity)) if resume else None,
+        )
+    code = conclude(
+        found,
+        start,
+        config,
+        measured=references,
+        validated=held,
+        fitted=shots,
+        terms=terms,
+        out=out,
+        record={
+            "start": name,
+            "sequences": list(noisy),
+            "targets": list(second or reference),
+            "frames": frames or "all",
+        },
+        report=report,
+        maps=maps,
+        profiles=profiles,
+        flip=flip,
+        json=json,
+    )
+    if _interrupted(found):
+        terminal.tell(f"interrupted; go on with the same command and --resume ({checkpoint.name})")
+        return 130
+    checkpoint.unlink(missing_ok=True)
+    if code and accept:
+        terminal.tell("accepted all the same (--accept)")
+        return 0
+    return code
+
+
+def _check(
+    noisy: tuple, reference: tuple, second: tuple, validate: tuple, validate_reference: tuple, robust: str
+) -> None:
+    if not noisy:
+        raise SvgfError(
+            "Got no sequence to tune on; wanted at least one: svgf-tune NOISY --reference REF -o tuned.toml."
+        )
+    if not reference and not second:
+        raise SvgfError(
+            "Got neither --reference nor --second; wanted what the images should look like, for each sequence."
+        )
+    for given, option in ((reference, "--reference"), (second, "--second")):
+        if given and len(given) != len(noisy):
+            raise SvgfError(
+                f"Got {len(noisy)} sequences and {len(given)} of {option}; wanted one for each, in the same order."
+            )
+    if len(validate) != len(validate_reference):
+        raise SvgfError(
+            f"Got {len(validate)} of --validate and {len(validate_reference)} of --validate-reference; wanted one for each."
+        )
+    if second and robust != "none":
+        raise SvgfError(
+            f"Got --robust {robust} with --second; wanted none: a robust mean of a noisy target is not "
+            "its mean, the fit would be biased."
+        )
+
+
+def _check_apart(noisy: tuple, frames: str | None, validate: tuple, validate_frames: str | None) -> None:
+    """What is validated on must not be tuned on: other sequences, or other frames of the same."""
+    from svgf_jax.sequences import parse_range
+
+    common = {str(Path(v).resolve()) for v in validate} & {str(Path(n).resolve()) for n in noisy}
+    if common and (
+        frames is None or validate_frames is None or {*parse_range(frames)} & {*parse_range(validate_frames)}
+    ):
+        raise SvgfError(
+            f"{common.pop()} is both tuned and validated on; the validation would say nothing. Take another sequence, "
+            "or other frames of it: --frames 0-7 --validate-frames 8-15."
+        )
+
+
+def _names(text: str | None) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip()) if text else ()
+
+
+def _interrupted(found: "Fit") -> bool:
+    return found.result.startswith("interrupted")
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM ends a fit as Ctrl-C does: with the best so far."""
+
+    def on_signal(number: int, _: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, on_signal)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
