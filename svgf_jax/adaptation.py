@@ -1,20 +1,21 @@
 """Following the light: correct the reprojected history where the illumination has changed, judged from the frames alone.
 
 Reprojection sees geometry only; when a lamp flickers or a shadow moves, the history shows light that is gone. A pixel's own
-sample can't tell: at one sample a pixel the noise is larger than the change. The mean over a neighbourhood on the same surface can.
-So the frame I and its reprojected history H are compared as means over *cells* of light_cell x light_cell pixels, pooled further by
-a-trous levels on the grid of cells, with the geometry weights w_z w_n and no luminance weight (noise averages out, change does not).
-The history is then corrected rather than shortened: it keeps its detail and its low noise, and takes on the new light at once.
+sample can't tell: at one sample a pixel the noise is larger than the change. The mean over a neighbourhood on the same surface
+can. So the frame I and its reprojected history H are compared as means over *cells* of light_cell x light_cell pixels, pooled
+further by a-trous levels on the grid of cells, with the geometry weights w_z w_n and no luminance weight (noise averages out,
+change does not). The history is then corrected rather than shortened: it keeps its detail and its low noise, and takes on the
+new light at once.
 
 1. *Gain*, for lamps: over a wide neighbourhood, g = 1 + s (mean I / mean H - 1), per color channel.
 2. *Offset*, for shadows: what is left, over a narrow neighbourhood, o = s (mean I - g mean H).
 
 s in [0, 1) is how significant the difference d of the mean luminances is against its own standard error e:
-s = max(0, 1 - (threshold e / d)^2), where e^2 is the variance of the samples' differences inside the neighbourhood over the effective
-number of them. A single firefly in a neighbourhood of n pixels makes d and e equally large, so it is never significant.
+s = max(0, 1 - (threshold e / d)^2), where e^2 is the variance of the samples' differences inside the neighbourhood over the
+effective number of them. A single firefly among n pixels makes d and e equally large, so it is never significant.
 
 Then, per pixel, from the four cells around it (bilinear, geometry weights): H' = max(0, g H + o), and the moments move with it:
-M1' = g M1 + o; the variance M2 - M1^2 scales with the square of the light and turns, as s rises, into the one just observed around.
+M1' = g M1 + o; the variance M2 - M1^2 scales with the square of the light and turns, as s rises, into the one just observed.
 Nothing here is in Schied et al. 2017; the gradient's normalisation is that of A-SVGF (Schied et al. 2018) in other clothes.
 """
 
@@ -183,6 +184,7 @@ def _gather(guides, slope, known, current, history, *, size: int, scalars: Param
 
 
 def _moments_of(current: Color, history: Color) -> Means:
+    current, history = jax.tree.map(lambda c: jnp.minimum(c, _largest(c.dtype)), (current, history))
     l, prev_l = luminance_of_planes(*current), luminance_of_planes(*history)  # noqa: E741
     return Means(current, history, l * l, l * prev_l, prev_l * prev_l)
 
@@ -309,7 +311,9 @@ def _apply(cells: Cells, corrections, guides, slope, known, history, moments, *,
         found = (weight > 1e-8) & (with_history > 0.0)
         divisor = jnp.where(found, weight, 1.0)
         corrected = [_correct(c, m, t, divisor) for c, m, t in zip(colors, pairs, totals, strict=True)]
-        return jax.tree.map(lambda new, old: jnp.where(found, new, old), tuple(corrected), tuple(zip(colors, pairs)))
+        return jax.tree.map(
+            lambda new, old: jnp.where(found, new, old), tuple(corrected), tuple(zip(colors, pairs, strict=True))
+        )
 
     result = lax.map(
         jax.checkpoint(pixel, prevent_cse=False),  # type: ignore[arg-type]
@@ -329,8 +333,16 @@ def _apply(cells: Cells, corrections, guides, slope, known, history, moments, *,
 
 def _correct(color: Color, moments: tuple[Array, Array], total: Correction, divisor: Array):
     c = jax.tree.map(lambda t: t / divisor, total)
-    corrected = tuple(jnp.maximum(g * h + o, 0.0) for g, h, o in zip(c.gain, color, c.offset, strict=True))
+    most = _largest(divisor.dtype)
+    corrected = tuple(
+        jnp.clip(g * h + o, 0.0, jnp.maximum(h, most)) for g, h, o in zip(c.gain, color, c.offset, strict=True)
+    )
     first, second = moments
-    variance = c.keep * jnp.maximum(second - first * first, 0.0) + c.variance
-    first = jnp.maximum(c.luminance_gain * first + luminance_of_planes(*c.offset), 0.0)
+    variance = jnp.minimum(c.keep * jnp.maximum(second - first * first, 0.0) + c.variance, most * most)
+    first = jnp.clip(c.luminance_gain * first + luminance_of_planes(*c.offset), 0.0, most)
     return corrected, (first, variance + first * first)
+
+
+def _largest(dtype) -> float:
+    """Squares of numbers up to this, and sums of them with weights, stay finite."""
+    return float(jnp.finfo(dtype).max) ** 0.5 / 2**6
