@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from svgf_jax.color import luminance_of_planes
-from svgf_jax.edges import depth_gradient, geometry_exponent, guides_of, luminance_scale
-from svgf_jax.sampling import STRIP_ROWS, planes, square_offsets, sum_over_taps
+from svgf_jax.edges import Guides, depth_gradient, geometry_exponent, guides_of, luminance_scale
+from svgf_jax.sampling import STRIP_ROWS, planes, square_offsets, stack_planes, sum_over_taps
 from svgf_jax.types import Config, Frame, Params, at_level
 
 _OFFSETS = square_offsets(2)
@@ -34,14 +34,38 @@ def atrous_filter(
     Returns:
         The filtered illumination, the filtered variance, and the illumination to feed back into the history.
     """
-    feedback = illumination
-    for level in range(config.levels):
-        illumination, variance = atrous_level(
-            illumination, variance, frame, level=level, params=params, strip_rows=strip_rows
+    if config.levels == 0:
+        return illumination, variance, illumination
+    guides, slope = guides_of(frame), depth_gradient(frame.depth, frame.object_id)
+    levels = range(config.levels)
+    fed_back = config.feedback_level if config.feedback_level < config.levels else config.levels - 1
+
+    def filter_level(state, level):
+        (colors, variances, feedback), (scalars, step_size, feeds_back) = state, level
+        colors, variances = _filter_planes(
+            colors,
+            variances,
+            guides,
+            slope,
+            scalars=scalars,
+            step_size=step_size,
+            largest_step=2 ** (config.levels - 1),
+            strip_rows=strip_rows,
         )
-        if level == min(config.feedback_level, config.levels - 1):
-            feedback = illumination
-    return illumination, variance, feedback
+        feedback = jax.tree.map(lambda new, old: jnp.where(feeds_back, new, old), colors, feedback)
+        return (colors, variances, feedback), None
+
+    colors = tuple(planes(signal) for signal in illumination)
+    state = (colors, tuple(variance), colors)
+    if strip_rows is None:
+        for i in levels:
+            state, _ = filter_level(state, (at_level(params, i), 2**i, i == fed_back))
+    else:  # compiled once for all levels
+        scalars = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (config.levels,)), params)
+        steps, feeds_back = jnp.asarray([2**i for i in levels], jnp.int32), jnp.asarray([i == fed_back for i in levels])
+        state, _ = lax.scan(filter_level, state, (scalars, steps, feeds_back))
+    colors, variances, feedback = state
+    return stack_planes(colors), jnp.stack(variances), stack_planes(feedback)
 
 
 def atrous_level(
@@ -57,23 +81,42 @@ def atrous_level(
 
     A zero sum of weights keeps the pixel. Shapes as in `atrous_filter`.
     """
-    scalars = at_level(params, level)
-    guides = guides_of(frame)
-    slope_x, slope_y = depth_gradient(frame.depth, frame.object_id)
-    colors = tuple(planes(signal) for signal in illumination)
-    variances = tuple(variance)
+    colors, variances = _filter_planes(
+        tuple(planes(signal) for signal in illumination),
+        tuple(variance),
+        guides_of(frame),
+        depth_gradient(frame.depth, frame.object_id),
+        scalars=at_level(params, level),
+        step_size=2**level,
+        largest_step=2**level,
+        strip_rows=strip_rows,
+    )
+    return stack_planes(colors), jnp.stack(variances)
+
+
+def _filter_planes(
+    colors: tuple[tuple[Array, ...], ...],
+    variances: tuple[Array, ...],
+    guides: Guides,
+    slope: tuple[Array, Array],
+    *,
+    scalars: Params,
+    step_size: int | Array,
+    largest_step: int,
+    strip_rows: int | None,
+) -> tuple[tuple[tuple[Array, ...], ...], tuple[Array, ...]]:
+    """`atrous_level` on planes: S colours of three, S variances; `slope` is grad z."""
+    dtype = guides.depth.dtype
     lumas = tuple(luminance_of_planes(*color) for color in colors)
     prefiltered = prefilter_variance(variances, guides.surface, strip_rows=strip_rows)
     scales = tuple(
         luminance_scale(v, sigma_luminance=scalars.sigma_luminance, luminance_epsilon=scalars.luminance_epsilon)
         for v in prefiltered
     )
-    one = jnp.ones((), illumination.dtype)
-    kernel = jnp.stack(
-        [jnp.asarray(k, illumination.dtype) * one for k in (scalars.kernel_far, scalars.kernel_near, 1.0)]
-    )
+    one = jnp.ones((), dtype)
+    kernel = jnp.stack([jnp.asarray(k, dtype) * one for k in (scalars.kernel_far, scalars.kernel_near, 1.0)])
     kernel = jnp.concatenate([kernel, kernel[1::-1]])  # (far, near, 1, near, far)
-    steps = (_OFFSETS * 2**level).astype(illumination.dtype)
+    steps = jnp.asarray(_OFFSETS, dtype) * jnp.asarray(step_size, dtype)
 
     def tap(sums, q, p, t):
         distance_y, distance_x, h = t
@@ -103,20 +146,21 @@ def atrous_level(
             _normalise(total, color, value) for total, color, value in zip(sums, p["color"], p["variance"], strict=True)
         )
 
-    zero = jnp.zeros((), illumination.dtype)
+    zero = jnp.zeros((), dtype)
     neighbours = {"guides": guides, "color": colors, "variance": variances, "luma": lumas}
     results = sum_over_taps(
         tap,
         finish,
         neighbours=neighbours,
-        centre={**neighbours, "slope": (slope_x, slope_y), "scale": scales},
-        offsets=_OFFSETS * 2**level,
-        per_tap=(jnp.asarray(steps[:, 0]), jnp.asarray(steps[:, 1]), jnp.outer(kernel, kernel).reshape(-1)),
+        centre={**neighbours, "slope": slope, "scale": scales},
+        offsets=_OFFSETS,
+        step_size=step_size,
+        largest_step=largest_step,
+        per_tap=(steps[:, 0], steps[:, 1], jnp.outer(kernel, kernel).reshape(-1)),
         sums=tuple((zero, (zero, zero, zero), zero) for _ in colors),
         strip_rows=strip_rows,
     )
-    filtered = jnp.stack([jnp.stack(color, axis=-1) for color, _ in results])
-    return filtered, jnp.stack([value for _, value in results])
+    return tuple(color for color, _ in results), tuple(value for _, value in results)
 
 
 def _add_tap(total, weight: Array, color: tuple[Array, ...], variance: Array):

@@ -62,6 +62,8 @@ def sum_over_taps(
     per_tap: Any = (),
     sums: Sums,
     where: Array | None = None,
+    step_size: int | Array = 1,
+    largest_step: int = 1,
     strip_rows: int | None = STRIP_ROWS,
 ) -> Planes:
     """Run a stencil: for every pixel p, add up what `tap` makes of each neighbour q, then `finish` the sums.
@@ -74,21 +76,23 @@ def sum_over_taps(
         finish: `finish(sums, p)` -> a tree of planes, the result.
         neighbours: planes `[H, W]` read at the taps, 0 outside the image.
         centre: planes `[H, W]` read at the pixel itself.
-        offsets: `[n, 2]` integers (dy, dx), pixels.
+        offsets: `[n, 2]` integers (dy, dx), in steps.
         per_tap: tree of `[n, ...]` arrays, one entry a tap.
         sums: tree of scalars, the sums' start (usually zeros).
         where: `[H, W]` bool; a strip without a True is not computed and its result is 0. None = everywhere.
+        step_size: pixels per step, an integer; may be traced (a loop over levels then compiles once) unless strip_rows is None.
+        largest_step: the largest value step_size may take.
         strip_rows: rows per strip; None = no strips and no loop, the plain form that the other is tested against.
 
     Returns:
         The tree that `finish` returns, with leaves `[H, W]`.
     """
     height, width = jax.tree.leaves(centre)[0].shape
-    top, left = (int(r) for r in np.abs(offsets).max(axis=0))
+    top, left = (int(r) * largest_step for r in np.abs(offsets).max(axis=0))
 
     if strip_rows is None:
         totals = jax.tree.map(lambda s: jnp.full((height, width), s), sums)
-        for i, (dy, dx) in enumerate(offsets):
+        for i, (dy, dx) in enumerate(offsets * step_size):
             q = jax.tree.map(lambda a, dy=int(dy), dx=int(dx): shift(a, dy, dx), neighbours)
             totals = tap(totals, q, centre, jax.tree.map(lambda a, i=i: a[i], per_tap))
         return finish(totals, centre)
@@ -98,7 +102,7 @@ def sum_over_taps(
     below = count * rows - height
     padded = jax.tree.map(lambda a: jnp.pad(a, ((top, top + below), (left, left))), neighbours)
     centred = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), (centre, where))
-    corners = jnp.asarray(offsets + np.array([top, left], dtype=np.int32))
+    corners = jnp.asarray(offsets) * jnp.asarray(step_size, jnp.int32) + jnp.array([[top, left]], jnp.int32)
 
     def compute(window: Planes, p: Planes) -> Planes:
         def body(totals: Sums, at: Any) -> tuple[Sums, None]:

@@ -190,8 +190,8 @@ MUTANTS = {
     "steps starting at 2": Mutant(
         "atrous",
         (
-            ("steps = (_OFFSETS * 2**level)", "steps = (_OFFSETS * 2**(level + 1))"),
-            ("offsets=_OFFSETS * 2**level,", "offsets=_OFFSETS * 2**(level + 1),"),
+            ("step_size=2**level,", "step_size=2 ** (level + 1),"),
+            ("largest_step=2**level,", "largest_step=2 ** (level + 1),"),
         ),
         "test_atrous_level",
         (0,),
@@ -209,7 +209,8 @@ MUTANTS = {
     ),
     "slope the same in all directions": mutant("atrous", SLOPE, ISOTROPIC, "test_atrous_level", 0),
     "slope not scaled with the step": mutant(
-        "atrous", "steps = (_OFFSETS * 2**level)", "steps = (_OFFSETS)", "test_atrous_level", 1
+        "atrous", "jnp.asarray(_OFFSETS, dtype) * jnp.asarray(step_size, dtype)", "jnp.asarray(_OFFSETS, dtype)",
+        "test_atrous_level", 1,
     ),
     "centre weight zero": mutant(
         "atrous", "scalars.kernel_near, 1.0)", "scalars.kernel_near, 0.0)", "test_atrous_level", 0
@@ -221,23 +222,22 @@ MUTANTS = {
     "luminance of the level before": Mutant(
         "atrous",
         (
-            ("    feedback = illumination\n    for level", "    feedback = guide = illumination\n    for level"),
-            ("illumination, variance, frame, level=level,", "illumination, variance, frame, guide=guide, level=level,"),
-            ("    level: int,\n", "    level: int,\n    guide=None,\n"),
-            ("*color) for color in colors)", "*color) for color in (colors if guide is None else map(planes, guide)))"),
+            ("scalars=scalars,\n", "scalars=scalars,\n            guide=tuple(map(planes, illumination)),\n"),
+            ("    scalars: Params,\n", "    scalars: Params,\n    guide=None,\n"),
+            ("*color) for color in colors)", "*color) for color in (guide or colors))"),
         ),
         "test_feedback",
         (1,),
     ),
     "history of the next level": mutant(
-        "atrous", "level == min(config.feedback_level, config.levels - 1)", "level == config.feedback_level + 1",
+        "atrous", "fed_back = config.feedback_level if", "fed_back = config.feedback_level + 1 if",
         "test_feedback", -1,
     ),
     "history of no level where feedback_level is beyond the last": mutant(
-        "atrous", "level == min(config.feedback_level, config.levels - 1)", "level == config.feedback_level", "test_feedback", 9
+        "atrous", " if config.feedback_level < config.levels else config.levels - 1", "", "test_feedback", 9
     ),
     "parameters of the first level for all": mutant(
-        "atrous", "scalars = at_level(params, level)", "scalars = at_level(params, 0)", "test_atrous_level", 1
+        "atrous", "scalars=at_level(params, level)", "scalars=at_level(params, 0)", "test_atrous_level", 1
     ),
     # Edge-stopping weights
     "variance for deviation": mutant(

@@ -199,7 +199,7 @@ def test_atrous_level(level):
     assert_close(values, expected_values)
 
 
-@pytest.mark.parametrize("feedback_level", [-1, 1, 9])
+@pytest.mark.parametrize("feedback_level", [-1, 0, 1, 9])
 def test_feedback(feedback_level):
     """Two levels, and the history is the output of the level that was asked for."""
     c = case()
@@ -211,7 +211,7 @@ def test_feedback(feedback_level):
     last, final = oracle.atrous_level(first, between, c.depth, c.normal, c.surface, c.gradient, 1, PARAMS)
     assert_close(light, last)
     assert_close(values, final)
-    assert_close(feedback, {-1: c.accumulated, 1: last, 9: last}[feedback_level])
+    assert_close(feedback, {-1: c.accumulated, 0: first, 1: last, 9: last}[feedback_level])
 
 
 def test_the_plain_form_of_the_loops():
@@ -219,6 +219,24 @@ def test_the_plain_form_of_the_loops():
     plain = compiled(atrous.atrous_level, c.accumulated, c.variance, c.frame, level=0, params=c.params, strip_rows=None)
     assert_close(plain[0], c.level(0)[0])
     assert_close(plain[1], c.level(0)[1])
+
+
+def test_the_plain_form_of_the_levels():
+    c = case()
+    filtered = [
+        compiled(
+            atrous.atrous_filter,
+            c.accumulated,
+            c.variance,
+            c.frame,
+            params=c.params,
+            config=to_config({"levels": 3, "feedback_level": 1}),
+            strip_rows=rows,
+        )
+        for rows in (4, None)
+    ]
+    for fast, plain in zip(*filtered, strict=True):
+        assert_close(fast, plain)
 
 
 def test_step():
