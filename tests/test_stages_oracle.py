@@ -230,7 +230,7 @@ def test_the_plain_form_of_the_levels():
             c.variance,
             c.frame,
             params=c.params,
-            config=to_config({"levels": 3, "feedback_level": 1}),
+            config=to_config({"levels": 2, "feedback_level": 1}),
             strip_rows=rows,
         )
         for rows in (4, None)
