@@ -83,7 +83,7 @@ def command(
         freeze: What not to tune after all.
         space: In what the image error is taken: x / (1 + x), or log(1 + x).
         temporal: Weight of the temporal error against the image error's 1.
-        prior: Weight of the distance from the start, in squared e-folds; 0.001, and 0.00001 with --second.
+        prior: Weight of the distance from the start, in squared e-folds; 0.02, and 0.00001 with --second.
         robust: Let single large errors count for less: their square grows linearly (huber) or levels off (geman-mcclure).
         robust_width: From which error on.
         solver: optimistix's Levenberg-Marquardt, Dogleg or Gauss-Newton.

@@ -11,7 +11,7 @@ from tune.free import TUNED_BY_DEFAULT, Coordinates, choose, natural, params_at,
 from tune.knowledge import Knowledge, learn
 from tune.residuals import REFERENCE, Term
 from tune.shots import Shot
-from tune.sweep import Problem, Sweep, pose, sweep
+from tune.sweep import Problem, Sweep, pose, pull, sweep
 
 _INTERRUPTED = "interrupted; this is the best so far"
 PATIENCE = 6  # trial points rejected in a row: the loss has nothing left that its derivatives know of
@@ -236,7 +236,7 @@ def _conclude(problem: Problem, progress: Progress, endings: dict[int, str], sho
     best_start = accepted[0].start if accepted else 0
     result = endings.get(best_start, "resumed after its end; this is the best so far")
     triangle, scatter, rows = progress.found
-    knowledge = learn(triangle, scatter, rows, progress.best_y, coordinates)
+    knowledge = learn(triangle, scatter, rows, progress.best_y, coordinates, pull=pull(problem, progress.best_y))
     notes = [*coordinates.notes, *(note for shot in shots for note in shot.notes)]
     return Fit(
         params=params_at(progress.best_y, coordinates),

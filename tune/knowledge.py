@@ -32,13 +32,24 @@ class Knowledge(NamedTuple):
     entangled: tuple[tuple[str, str], ...]
 
 
-def learn(triangle: np.ndarray, scatter: np.ndarray, rows: int, y: np.ndarray, coordinates: Coordinates) -> Knowledge:
-    """What the factor `[n + 1, n + 1]` of [J r] and the scatter of its blocks' gradients say at the fitted point."""
+def learn(
+    triangle: np.ndarray,
+    scatter: np.ndarray,
+    rows: int,
+    y: np.ndarray,
+    coordinates: Coordinates,
+    *,
+    pull: np.ndarray | float = 0.0,
+) -> Knowledge:
+    """What the factor `[n + 1, n + 1]` of [J r] and the scatter of its blocks' gradients say at the fitted point.
+
+    `pull` `[n]`: what of the squares of J's columns is from terms that do not look at pixels. A prior is no knowledge.
+    """
     n = y.size
     labels = coordinates.labels
     jacobian, residual = triangle[:, :n], triangle[:, n]
     loss = max(float(residual @ residual), np.finfo(float).tiny)
-    leverage = np.square(jacobian).sum(0) / loss
+    leverage = np.maximum(np.square(jacobian).sum(0) - pull, 0.0) / loss
     free = np.flatnonzero(leverage > UNDETERMINED)
     errors = np.full(n, np.inf)
     correlations = np.eye(n)

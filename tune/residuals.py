@@ -102,7 +102,7 @@ def geman_mcclure(residual: Residual, width: float) -> Residual:
 REFERENCE = (
     Term("image", image_error),
     Term("temporal", temporal_error, 0.5),
-    Term("prior", prior, 1e-3, pixels=False),
+    Term("prior", prior, 0.02, pixels=False),
 )
 """The terms for a reference."""
 
@@ -121,7 +121,7 @@ def reference_terms(
     *,
     space: str = "reinhard",
     temporal: float = 0.5,
-    prior_weight: float = 1e-3,
+    prior_weight: float = 0.02,
     robust: str = "none",
     width: float = 0.1,
 ) -> tuple[Term, ...]:

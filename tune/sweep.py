@@ -6,6 +6,7 @@ Memory is that of a frame: frames are read ahead, differentiated and folded away
 from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -123,6 +124,18 @@ def sweep(problem: Problem, y: np.ndarray, *, linear: bool, bound: float = np.in
                 complete = False
                 break
     return Sweep(float(losses.sum()), losses, triangle if linear else None, scatter if linear else None, rows, complete)
+
+
+def pull(problem: Problem, y: np.ndarray) -> np.ndarray:
+    """The squares of the columns of J, `[n]`, that are from terms which look at coordinates alone."""
+    squares = np.zeros(y.size)
+    away = jnp.asarray(y - problem.y_start)
+    nothing: Any = None
+    for term in problem.terms:
+        if not term.pixels:
+            change = np.asarray(jax.jacfwd(partial(term.residual, nothing, nothing))(away)).reshape(-1, y.size)
+            squares += term.weight * np.square(change).mean(axis=0)
+    return squares
 
 
 def _reduce(block: tuple[jax.Array, list[jax.Array]]) -> tuple[float, np.ndarray | None, np.ndarray | None]:
