@@ -187,15 +187,7 @@ MUTANTS = {
         "test_atrous_level",
         (0,),
     ),
-    "steps starting at 2": Mutant(
-        "atrous",
-        (
-            ("step_size=2**level,", "step_size=2 ** (level + 1),"),
-            ("largest_step=2**level,", "largest_step=2 ** (level + 1),"),
-        ),
-        "test_atrous_level",
-        (0,),
-    ),
+    "steps starting at 2": mutant("atrous", "jnp.asarray([2**i for", "jnp.asarray([2 ** (i + 1) for", "test_feedback", 1),
     "variance blur not renormalised": mutant(
         "atrous", "jnp.where(any_weight, t / jnp.where(any_weight, weights, 1.0), 0.0)", "jnp.where(any_weight, t, 0.0)",
         "test_atrous_level", 0,
@@ -219,25 +211,28 @@ MUTANTS = {
         "atrous", "(scalars.kernel_far, scalars.kernel_near, 1.0)", "(scalars.kernel_near, scalars.kernel_far, 1.0)",
         "test_atrous_level", 0,
     ),
-    "luminance of the level before": Mutant(
+    "luminance of the light that came in, at every level": Mutant(
         "atrous",
         (
-            ("scalars=scalars,\n", "scalars=scalars,\n            guide=tuple(map(planes, illumination)),\n"),
-            ("    scalars: Params,\n", "    scalars: Params,\n    guide=None,\n"),
-            ("*color) for color in colors)", "*color) for color in (guide or colors))"),
+            ("            strip_rows=strip_rows,\n        )\n        feedback",
+             "            strip_rows=strip_rows,\n            first=first,\n        )\n        feedback"),
+            ("    state = (colors, tuple(variance), colors)", "    state = (colors, tuple(variance), colors)\n    first = colors"),
+            ("    strip_rows: int | None,\n) ->", "    strip_rows: int | None,\n    first=None,\n) ->"),
+            ("(*color) for color in colors)", "(*color) for color in first or colors)"),
         ),
         "test_feedback",
         (1,),
     ),
     "history of the next level": mutant(
-        "atrous", "fed_back = config.feedback_level if", "fed_back = config.feedback_level + 1 if",
-        "test_feedback", -1,
+        "atrous", "i == fed_back for i in levels])", "i == fed_back + 1 for i in levels])", "test_feedback", -1
     ),
     "history of no level where feedback_level is beyond the last": mutant(
-        "atrous", " if config.feedback_level < config.levels else config.levels - 1", "", "test_feedback", 9
+        "atrous", "config.feedback_level if config.feedback_level < config.levels else config.levels - 1",
+        "config.feedback_level", "test_feedback", 9,
     ),
     "parameters of the first level for all": mutant(
-        "atrous", "scalars=at_level(params, level)", "scalars=at_level(params, 0)", "test_atrous_level", 1
+        "atrous", "scalars = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf,",
+        "scalars = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.atleast_1d(leaf)[0],", "test_feedback", 1,
     ),
     # Edge-stopping weights
     "variance for deviation": mutant(
