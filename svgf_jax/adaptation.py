@@ -11,7 +11,7 @@ new light at once.
 2. *Offset*, for shadows: what is left, over a narrow neighbourhood, o = s (mean I - g mean H).
 
 s in [0, 1) is how significant the difference d of the mean luminances is against its own standard error e:
-s = max(0, 1 - (threshold e / d)^2), where e^2 is the variance of the samples' differences inside the neighbourhood over the
+s = max(0, 1 - (threshold e / d)^4), where e^2 is the variance of the samples' differences inside the neighbourhood over the
 effective number of them. A single firefly among n pixels makes d and e equally large, so it is never significant.
 
 Then, per pixel, from the four cells around it (bilinear, geometry weights): H' = max(0, g H + o), and the moments move with it:
@@ -31,7 +31,7 @@ from svgf_jax.edges import Guides, depth_gradient, geometry_exponent, guides_of
 from svgf_jax.sampling import planes, square_offsets, sum_over_taps
 from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
 
-GAIN_LEVELS = 2  # a-trous levels on the grid of cells: reach of +-6 cells
+GAIN_LEVELS = 3  # a-trous levels on the grid of cells: reach of +-14 cells
 OFFSET_LEVELS = 1  # +-2 cells
 LARGEST_GAIN = 50.0
 _OFFSETS = square_offsets(2)
@@ -270,7 +270,7 @@ def _significance(current: Color, previous: Color, square: Array, effective: Arr
     variance = jnp.maximum(square - change, 0.0)
     noise = threshold * threshold * effective * variance
     significant = change > noise + _TINY  # inside, the quotient and its derivative are bounded
-    return jnp.where(significant, 1.0 - noise / jnp.where(significant, change, 1.0), 0.0), variance
+    return jnp.where(significant, 1.0 - (noise / jnp.where(significant, change, 1.0)) ** 2, 0.0), variance
 
 
 def _ratio(current: Array, previous: Array, scale: Array, significance: Array) -> Array:

@@ -1,0 +1,271 @@
+"""Following the light: against plain loops, on steps of the light with exact statistics, and what it must leave alone."""
+
+import functools
+
+import bridge
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+
+import svgf_jax as sj
+from svgf_jax.adaptation import follow_light
+from svgf_jax.color import demodulate
+from svgf_jax.reprojection import reproject
+from svgf_jax.sanitation import sanitise
+from svgf_jax.types import Config, Params
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+KERNEL = np.array([1, 4, 6, 4, 1]) / 16
+PARAMS, CONFIG = sj.preset("adaptive")
+
+
+# The oracle: one pixel, one cell, one tap at a time, from the module's docstring.
+
+
+def follow_light_by_loops(previous, illumination, frame, params, size):
+    ids, depth, normal = frame["object_id"], frame["depth"], frame["normal"]
+    height, width = depth.shape
+    slope = slopes(depth, ids)
+    rows, columns = -(-height // size), -(-width // size)
+
+    def weight(p, q):
+        if ids[p] == -1 or ids[q] == -1:
+            return 0.0
+        dy, dx = q[0] - p[0], q[1] - p[1]
+        tolerance = params.sigma_depth * abs(slope[p] @ [dx, dy]) + params.depth_epsilon * depth[p]
+        cosine = normal[p] @ normal[q]
+        if cosine <= 1e-30:
+            return 0.0
+        return np.exp(-abs(depth[p] - depth[q]) / tolerance) * cosine**params.light_sigma_normal
+
+    def inside(p):
+        return 0 <= p[0] < height and 0 <= p[1] < width
+
+    def centre(cell):
+        return (cell[0] * size + size // 2, cell[1] * size + size // 2)
+
+    cells = [(i, j) for i in range(rows) for j in range(columns) if inside(centre((i, j)))]
+    out = {k: np.array(v) for k, v in previous.items()}
+    for signal in range(len(illumination)):
+        current, history = illumination[signal], previous["illumination"][signal]
+        # Sums over each cell's own pixels: weight, weight^2, and the weighted samples themselves.
+        sums = {}
+        for cell in cells:
+            found = []
+            for y in range(cell[0] * size, min(height, cell[0] * size + size)):
+                for x in range(cell[1] * size, min(width, cell[1] * size + size)):
+                    if previous["valid"][y, x]:
+                        found.append((weight(centre(cell), (y, x)), current[y, x], history[y, x]))
+            sums[cell] = found
+
+        def pooled(levels, gain, luminance_gain, sums=sums):
+            """Mean current and corrected previous color, mean squared difference, 1 / effective number, per cell."""
+            state = {}
+            for cell, samples in sums.items():
+                total = np.zeros(9)
+                for w, i, h in samples:
+                    difference = i @ LUMINANCE - luminance_gain[cell] * (h @ LUMINANCE)
+                    total += w * np.array([1, w, *i, *(gain[cell] * h), difference**2])
+                state[cell] = total
+            for level in range(levels):
+                after = {}
+                for cell in state:
+                    total = np.zeros(9)
+                    for dy in range(-2, 3):
+                        for dx in range(-2, 3):
+                            q = (cell[0] + dy * 2**level, cell[1] + dx * 2**level)
+                            if q in state:
+                                w = KERNEL[dy + 2] * KERNEL[dx + 2] * weight(centre(cell), centre(q))
+                                total += w * np.array([1, w, *[1] * 7]) * state[q]
+                    after[cell] = total
+                state = after
+            return {
+                cell: (t[2:5] / t[0], t[5:8] / t[0], t[8] / t[0], t[1] / t[0] ** 2)
+                if t[0] > 1e-12
+                else (np.zeros(3), np.zeros(3), 0.0, 1.0)
+                for cell, t in state.items()
+            }
+
+        def significance(i, h, square, share, threshold):
+            change = (i @ LUMINANCE - h @ LUMINANCE) ** 2
+            variance = max(0.0, square - change)
+            noise = threshold**2 * share * variance
+            return (1 - (noise / change) ** 2 if change > noise + 1e-12 else 0.0), variance
+
+        def ratio(i, h, scale, s):
+            return 1 + s * (np.clip((i + 0.01 * scale) / (h + 0.01 * scale), 1 / 50, 50) - 1) if scale > 1e-6 else 1.0
+
+        gain, luminance_gain = {c: np.ones(3) for c in cells}, dict.fromkeys(cells, 1.0)
+        surely, corrections = {}, {}
+        for cell, (i, h, square, share) in pooled(3, gain, luminance_gain).items():
+            s, _ = significance(i, h, square, share, params.light_gain_threshold)
+            scale = h @ LUMINANCE
+            gain[cell] = np.array([ratio(a, b, scale, s) for a, b in zip(i, h, strict=True)])
+            luminance_gain[cell] = ratio(i @ LUMINANCE, scale, scale, s)
+            surely[cell] = s
+        for cell, (i, h, square, share) in pooled(1, gain, luminance_gain).items():
+            s, variance = significance(i, h, square, share, params.light_offset_threshold)
+            grown = ratio(i @ LUMINANCE, h @ LUMINANCE, h @ LUMINANCE, s)
+            keep = (1 - surely[cell]) * (1 - s) * (luminance_gain[cell] * grown) ** 2
+            new = (1 - (1 - surely[cell]) * (1 - s)) * variance
+            corrections[cell] = np.array([*gain[cell], *(s * (i - h)), luminance_gain[cell], keep, new])
+
+        known = {c for c in cells if sum(w for w, _, _ in sums[c]) > 1e-12}
+        for y in range(height):
+            for x in range(width):
+                at = ((y - size // 2) / size, (x - size // 2) / size)
+                corner = (int(np.floor(at[0])), int(np.floor(at[1])))
+                total, weights = np.zeros(9), 0.0
+                for dy in (0, 1):
+                    for dx in (0, 1):
+                        q = (corner[0] + dy, corner[1] + dx)
+                        if q in known:
+                            part = (1 - abs(at[0] - q[0])) * (1 - abs(at[1] - q[1]))
+                            w = part * weight((y, x), centre(q))
+                            total, weights = total + w * corrections[q], weights + w
+                if not previous["valid"][y, x] or weights <= 1e-8:
+                    continue
+                c = total / weights
+                out["illumination"][signal, y, x] = np.maximum(0, c[:3] * history[y, x] + c[3:6])
+                m1, m2 = previous["moments"][signal, y, x]
+                variance = c[7] * max(0, m2 - m1**2) + c[8]
+                m1 = max(0, c[6] * m1 + c[3:6] @ LUMINANCE)
+                out["moments"][signal, y, x] = m1, variance + m1**2
+    return out
+
+
+def slopes(depth, ids):
+    height, width = depth.shape
+    out = np.zeros((height, width, 2))
+    for y in range(height):
+        for x in range(width):
+            for axis, (dy, dx) in enumerate([(0, 1), (1, 0)]):
+                sides = []
+                for sign in (1, -1):
+                    q = (y + sign * dy, x + sign * dx)
+                    if 0 <= q[0] < height and 0 <= q[1] < width and ids[q] == ids[y, x]:
+                        sides.append(sign * (depth[q] - depth[y, x]))
+                sides.sort(key=abs)
+                if len(sides) == 2 and abs(sides[0]) == abs(sides[1]):
+                    out[y, x, axis] = (sides[0] + sides[1]) / 2
+                elif sides:
+                    out[y, x, axis] = sides[0]
+    return out
+
+
+@pytest.mark.parametrize("size", [4, 3])
+def test_the_stage_is_what_its_docstring_says(size):
+    rng = np.random.default_rng(size)
+    frames = scenes.synthetic(size, 26, 23, frames=2, signals=2)
+    frame, _ = sanitise(bridge.to_frame(frames[1]))
+    history = sj.init(bridge.to_frame(frames[0]))._replace(
+        illumination=rng.gamma(2.0, 0.5, (2, 26, 23, 3)),
+        moments=np.stack([m := rng.gamma(2.0, 0.5, (2, 26, 23)), m**2 + rng.gamma(1.0, 1.0, m.shape)], axis=-1),
+        history_length=np.full((26, 23), 5.0),
+        depth=frames[0]["depth"],
+        normal=frames[0]["normal"],
+        object_id=np.asarray(frames[0]["object_id"], np.int32),
+    )
+    illumination = demodulate(frame.radiance, frame.albedo)
+    illumination = illumination.at[1].multiply(4.0)  # a change beyond the scene's own
+    params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), PARAMS._replace(light_sigma_normal=20.0))
+    previous = reproject(jax.tree.map(jnp.asarray, history), frame, params=params)
+    got = jax.jit(functools.partial(follow_light, config=Config(light_cell=size)))(
+        previous, illumination, frame, params=params
+    )
+    plain = jax.tree.map(np.asarray, frame)._asdict()
+    wanted = follow_light_by_loops(
+        jax.tree.map(np.asarray, previous)._asdict(),
+        np.asarray(illumination),
+        plain,
+        PARAMS._replace(light_sigma_normal=20.0),
+        size,
+    )
+    assert np.abs(wanted["illumination"] - np.asarray(previous.illumination)).max() > 0.1
+    for name in ("illumination", "moments"):
+        np.testing.assert_allclose(np.asarray(getattr(got, name)), wanted[name], rtol=1e-9, atol=1e-9)
+
+
+def test_without_cells_the_history_is_left_alone():
+    previous = object()
+    assert follow_light(previous, None, None, params=Params(), config=Config()) is previous  # type: ignore[arg-type]
+
+
+# Steps of the light on a plain wall, whose statistics are exact.
+
+NOISES = {
+    "uniform": lambda rng, shape: rng.uniform(0.0, 2.0, shape),
+    "exponential": lambda rng, shape: rng.exponential(1.0, shape),
+    "heavy-tailed": lambda rng, shape: rng.lognormal(-0.75, np.sqrt(1.5), shape),  # mean 1, variance 3.5
+}
+STEADY, AFTER = 12, 3
+SHAPE = (72, 80)
+
+
+@functools.cache
+def respond(noise: str, samples: int, factor: float, config: Config = CONFIG):
+    """Mean filtered luminance and the accumulated history of a wall whose light steps by `factor` after `STEADY` frames."""
+    rng = np.random.default_rng(7)
+    step = bridge.jitted_step(config, bridge.QUICK)
+    history, levels, accumulated = None, [], None
+    for t in range(STEADY + AFTER):
+        light = NOISES[noise](rng, (samples, 1, *SHAPE, 1)).mean(axis=0) * (factor if t >= STEADY else 1.0)
+        frame = bridge.to_frame({**scenes.flat(*SHAPE), "radiance": np.broadcast_to(light, (1, *SHAPE, 3))}, np.float32)
+        history = sj.init(frame) if history is None else history
+        history, output = step(history, frame, params=PARAMS)
+        levels.append(float(output.image.mean()))
+        if t == STEADY - 1:
+            accumulated = np.asarray(history.illumination[0, ..., 1])
+    return levels, accumulated
+
+
+@pytest.mark.parametrize("factor", [0.1, 2.0, 10.0])
+@pytest.mark.parametrize("samples", [1, 2, 4])
+@pytest.mark.parametrize("noise", list(NOISES))
+def test_a_step_of_the_light_is_followed_at_once(noise, samples, factor):
+    levels, _ = respond(noise, samples, factor)
+    travelled = (np.array(levels[STEADY:]) - 1.0) / (factor - 1.0)
+    assert travelled[1] > 0.9, travelled
+    assert travelled[-1] < 1.1, travelled
+
+
+@pytest.mark.parametrize("noise", list(NOISES))
+@pytest.mark.parametrize("samples", [1, 4])
+def test_steady_noise_is_not_taken_for_change(noise, samples):
+    """The history is nearly as smooth as without the stage: mostly above 90 % of its effective length, by its variance."""
+    _, with_stage = respond(noise, samples, 2.0)
+    _, without = respond(noise, samples, 2.0, CONFIG._replace(light_cell=0))
+    assert without.var() / with_stage.var() > 0.85
+    assert abs(with_stage.mean() - 1.0) < 0.03
+
+
+def test_steps_and_scan_agree_and_bad_pixels_stay_out():
+    frames = bridge.to_frames(scenes.synthetic(3, 29, 34, frames=3, dirty=True), np.float32)
+    _, scanned = bridge.jitted_denoise(CONFIG, bridge.QUICK)(frames, params=PARAMS)
+    history = None
+    for t in range(3):
+        frame = jax.tree.map(lambda leaf, t=t: leaf[t], frames)
+        history = sj.init(frame) if history is None else history
+        history, output = bridge.jitted_step(CONFIG, bridge.QUICK)(history, frame, params=PARAMS)
+        np.testing.assert_allclose(output.image, scanned.image[t], rtol=1e-5, atol=1e-5)
+        assert np.isfinite(output.illumination).all() and np.isfinite(history.moments).all()
+
+
+def test_it_is_differentiable_in_its_parameters():
+    """Forward and reverse mode agree with each other and are finite, through a scene with bad pixels and dark ones."""
+    frames = bridge.to_frames(scenes.synthetic(5, 17, 18, frames=2, dirty=True))
+
+    def error(values):
+        params = Params(**dict(zip(names, values, strict=True)))
+        _, output = sj.denoise(frames, params=params, config=Config(levels=0, light_cell=4))
+        return jnp.sum(jnp.tanh(output.illumination))
+
+    names = ("light_gain_threshold", "light_offset_threshold", "light_sigma_normal", "alpha")
+    values = tuple(jnp.asarray(v, jnp.float64) for v in (1.6, 2.6, 64.0, 0.3))
+    reverse = jax.jit(jax.grad(error), compiler_options=dict(bridge.QUICK))(values)
+    forward = jax.jit(jax.jacfwd(error), compiler_options=dict(bridge.QUICK))(values)
+    assert all(np.isfinite(g) for g in reverse)
+    assert any(float(g) != 0.0 for g in reverse[:2])
+    np.testing.assert_allclose(forward, reverse, rtol=1e-6, atol=1e-9)
