@@ -58,20 +58,20 @@ def profile(found: Fit, shots: Sequence[Shot], terms: Sequence[Term]) -> tuple[P
 
 def sensitivity(found: Fit, shot: Shot, terms: Sequence[Term], *, tangent_batch: int = 8) -> Sensitivity:
     """Maps over a shot, of the terms that look at pixels; in the memory of one frame's derivatives."""
-    pixel_terms = [term for term in terms if term.pixels]
     coordinates = found.coordinates
     start = to_free(coordinates.start, coordinates)
-    problem = pose(coordinates, start, pixel_terms, [shot], tangent_batch=tangent_batch)
+    problem = pose(coordinates, start, terms, [shot], tangent_batch=tangent_batch)
     with closing(read_ahead(shot.read, [0], threads=1)) as examples:
         height, width = np.shape(next(iter(examples)).frame.depth)
     error, slopes = np.zeros((height, width)), np.zeros((len(coordinates.free), height, width))
     with closing(frame_blocks(problem, 0, shot, found.y, True)) as blocks:
         for residual, columns in blocks:
-            r = jnp.asarray(residual).reshape(height, width, -1)
+            seen = residual.size // (height * width) * height * width  # what does not look at pixels comes last
+            r = jnp.asarray(residual)[:seen].reshape(height, width, -1)
             error += np.asarray((r * r).sum(-1), np.float64)
             row = 0
             for part in columns:
-                change = part.reshape(part.shape[0], *r.shape)
+                change = part[:, :seen].reshape(part.shape[0], *r.shape)
                 slopes[row : row + part.shape[0]] += np.asarray((change * r[None]).sum(-1), np.float64)
                 row += part.shape[0]
     return Sensitivity(error * height * width, slopes * height * width)

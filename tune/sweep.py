@@ -25,6 +25,9 @@ GATE_STEP = 0.25
 """Half the step, in free coordinates, across which the derivative in a threshold is taken."""
 
 
+_NOTHING = 1e-14  # a mean squared error that is only rounding
+
+
 class Problem(NamedTuple):
     """What is fitted to what.
 
@@ -90,12 +93,12 @@ def pose(
     problem = Problem(coordinates, y_start, terms, tuple(shots), np.ones(len(shots)), max(1, tangent_batch), frame_pass)
     # The others are 0 at the start: the prior by definition.
     losses = sweep(problem, y_start, linear=False).shot_losses * len(shots)
-    if not np.isfinite(losses).all() or (losses <= 0).any():
+    if not np.isfinite(losses).all() or (losses <= _NOTHING).any():
         bad = ", ".join(
-            f"{s.name}: {v:g}" for s, v in zip(shots, losses, strict=True) if not (np.isfinite(v) and v > 0)
+            f"{s.name}: {v:g}" for s, v in zip(shots, losses, strict=True) if not (np.isfinite(v) and v > _NOTHING)
         )
         raise SvgfError(
-            f"the error at the start is not a positive number ({bad}); wanted references that differ from the filtered images"
+            f"the error at the start is nothing to go by ({bad}); wanted references that differ from the filtered images"
         )
     return problem._replace(pixel_weights=1 / losses if balance else np.full(len(shots), 1 / losses.mean()))
 
