@@ -65,7 +65,7 @@ def test_free_coordinates_never_leave_the_bounds(name, y):
     value = natural(np.array([y]), coordinates)[0]
     assert least <= value <= most
     assert np.isfinite(value)
-    traced = float(getattr(from_free(jnp.asarray([y], jnp.float32), coordinates), name))
+    traced = float(getattr(from_free(jnp.asarray([y], jnp.float32), coordinates.start, coordinates.free), name))
     assert least <= traced <= most
     assert np.isfinite(traced)
 
@@ -75,14 +75,14 @@ def test_free_coordinates_there_and_back(per_level):
     params = Params(short_history_boost=3.0, sigma_luminance=np.array([4.0, 3.0, 2.0, 2.0, 1.0]))
     coordinates = choose(params, CONFIG, names=["all"], per_level=per_level)
     y = to_free(coordinates.start, coordinates)
-    traced, host = from_free(jnp.asarray(y), coordinates), params_at(y, coordinates)
+    traced, host = from_free(jnp.asarray(y), coordinates.start, coordinates.free), params_at(y, coordinates)
     for name, value in params._asdict().items():
         np.testing.assert_allclose(
             getattr(host, name), np.broadcast_to(value, np.shape(getattr(host, name))), rtol=1e-12
         )
         np.testing.assert_allclose(np.asarray(getattr(traced, name)), getattr(host, name), rtol=1e-12)
         assert np.ndim(getattr(host, name)) == (
-            1 if name in PER_LEVEL and per_level or name == "sigma_luminance" else 0
+            1 if (name in PER_LEVEL and per_level) or name == "sigma_luminance" else 0
         )
     assert not coordinates.notes
 
@@ -90,9 +90,9 @@ def test_free_coordinates_there_and_back(per_level):
 def test_slope_is_the_derivative_of_the_value():
     coordinates = choose(Params(short_history_boost=2.0), CONFIG, names=["all"])
     y = to_free(coordinates.start, coordinates)
-    jacobian = jax.jacfwd(lambda y: jnp.stack([jnp.asarray(leaf) for leaf in from_free(y, coordinates)]))(
-        jnp.asarray(y)
-    )
+    jacobian = jax.jacfwd(
+        lambda y: jnp.stack([jnp.asarray(leaf) for leaf in from_free(y, coordinates.start, coordinates.free)])
+    )(jnp.asarray(y))
     np.testing.assert_allclose(np.diag(np.asarray(jacobian)), slope(y, coordinates), rtol=1e-9)
 
 

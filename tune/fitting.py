@@ -100,7 +100,7 @@ def fit(
     freeze: Iterable[str] = (),
     solver: str | Any = "lm",
     max_steps: int = 30,
-    least_gain: float = 1e-3,
+    least_gain: float | None = None,
     starts: int = 1,
     seed: int = 0,
     tangent_batch: int = 8,
@@ -118,7 +118,8 @@ def fit(
         names, per_level, freeze: which numbers are free; see `tune.free.choose`.
         solver: `lm`, `dogleg`, `gauss-newton`, or an optimistix least-squares solver of one's own.
         max_steps: trial points a start, at most.
-        least_gain: an accepted step that lowers the loss by less than this part of it is the last.
+        least_gain: an accepted step that lowers the loss by less than this part of it is the last; None = 1e-3, and 1e-5 for noisy
+            targets, whose noise is most of the loss and stays.
         starts: the first is `params`; each other is some way off, in all free coordinates, drawn from `seed`.
         tangent_batch: derivatives taken at a time: fewer need less memory and more time, for the same result.
         balance: each shot counts alike, whatever its error at the start.
@@ -131,6 +132,8 @@ def fit(
         SvgfError: nothing to tune, frames that cannot be read, an error that cannot be lowered because it is not a number.
     """
     coordinates = choose(params, config, names=names, per_level=per_level, freeze=freeze)
+    if least_gain is None:
+        least_gain = 1e-5 if any(term.pilot for term in residuals) else 1e-3
     y_start = to_free(coordinates.start, coordinates)
     chosen = solvers.make_solver(solver) if isinstance(solver, str) else solver
     fresh = solvers.begin(chosen, y_start)

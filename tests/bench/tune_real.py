@@ -68,7 +68,7 @@ def tuned(kind: str, names: list[str], **options) -> dict:
         noisy_terms() if noisy else reference_terms(**options),
         per_level=PER_LEVEL if kind == "level" else (),
         on_iteration=tell,
-        least_gain=5e-3,
+        least_gain=1e-5 if noisy else 5e-3,
         max_steps=9,
     )
     assert fit.knowledge is not None

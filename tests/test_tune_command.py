@@ -1,0 +1,148 @@
+"""`svgf-tune` as its users meet it: files in, a parameter file and a page out, and what it says when something is wrong."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from svgf_jax import Config, Params, exr, load_params
+from svgf_jax.demo import sample
+
+ROOT = Path(__file__).parents[1]
+
+
+def command(*arguments, cwd=None, **options):
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "160"}
+    call = [sys.executable, "-m", "tune", *map(str, arguments)]
+    return subprocess.run(call, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, **options)
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory):
+    """A crop of the bundled sample, small enough to tune on within seconds."""
+    folder = tmp_path_factory.mktemp("shots")
+    for path in sorted(sample().glob("*.exr")):
+        image = exr.read(path)
+        channels = {name: np.ascontiguousarray(plane[20:56, 30:78]) for name, plane in image.channels.items()}
+        exr.write(folder / path.name, exr.new_image(channels))
+    return folder
+
+
+def test_help_and_errors_answer_without_jax(tmp_path):
+    prelude = "import sys, tune.__main__ as m\ntry: m.main({!r})\nfinally: print('jax' in sys.modules)"
+    for arguments in (["--help"], ["x"], ["x", "-o", "y.toml"]):
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        done = subprocess.run(
+            [sys.executable, "-c", prelude.format(arguments)],
+            env=environment,
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+        )
+        assert done.stdout.strip().endswith("False"), done.stderr
+        assert done.returncode == (0 if arguments == ["--help"] else 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["noisy", "-o", "t.toml"], "neither --reference nor --second"),
+        (["a", "b", "--reference", "r", "-o", "t.toml"], "2 sequences and 1 of --reference"),
+        (["a", "--reference", "r", "-o", "nowhere/t.toml"], "no folder"),
+        (
+            ["a", "--reference", "r", "--validate", "a", "--validate-reference", "r", "-o", "t.toml"],
+            "both tuned and validated",
+        ),
+        (["a", "--second", "r", "--robust", "huber", "-o", "t.toml"], "biased"),
+        (["a", "--reference", "r", "--validate", "v", "-o", "t.toml"], "wanted one for each"),
+        (["a", "--reference", "r", "-o", "t.toml"], "no such"),
+    ],
+)
+def test_what_is_wrong_is_said(arguments, said, tmp_path):
+    done = command(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_references_of_another_size_and_missing_ones(shots, tmp_path):
+    refs = tmp_path / "refs"
+    refs.mkdir()
+    for path in sorted(shots.glob("ref_*.exr"))[:3]:
+        image = exr.read(path)
+        exr.write(refs / path.name, exr.new_image({n: np.ascontiguousarray(p[:-2]) for n, p in image.channels.items()}))
+    done = command(shots, "--reference", refs, "-o", tmp_path / "t.toml", "--set", "levels=1")
+    assert done.returncode == 2
+    assert "references of the same size" in done.stderr
+    assert "lacks frames" in done.stderr
+    assert not (tmp_path / "t.toml").exists()
+
+
+def test_tunes_validates_reports(shots, tmp_path):
+    """A few steps on the first frames, validated on the rest: the file, the numbers, the page, the maps."""
+    out, page = tmp_path / "tuned.toml", tmp_path / "report.html"
+    options = [
+        "--tune",
+        "alpha,sigma_luminance,max_history",
+        "--set",
+        "levels=1",
+        "--frames",
+        "0-5",
+        "--max-steps",
+        "2",
+    ]
+    options += ["--validate", shots, "--validate-reference", shots, "--validate-frames", "6-9", "--accept", "--json"]
+    done = command(
+        shots, "--reference", shots, "-o", out, "--report", page, "--maps", tmp_path / "maps", "--profiles", *options
+    )
+    assert done.returncode == 0, done.stderr
+    assert "loss" in done.stderr
+    params, config = load_params(out)
+    assert config == Config(levels=1)
+    assert params.alpha != Params().alpha
+    result = json.loads(done.stdout)
+    assert result["parameters"]["alpha"]["value"] == pytest.approx(params.alpha)
+    assert [s["role"] for s in result["scores"]] == ["tuned", "validation"]
+    assert result["loss"] < 1
+    assert "max_history" in result["undetermined"]
+    assert len(result["profiles"]) == 3
+    maps = exr.read(tmp_path / "maps" / "sensitivity.exr")
+    assert set(maps.channels) == {"error", "slope.alpha", "slope.sigma_luminance", "slope.max_history"}
+    html = page.read_text()
+    assert "http" not in html.replace("http://www.w3.org", "")  # self-contained
+    for word in (
+        "Loss",
+        "Parameters",
+        "undetermined",
+        "Before and after",
+        "Frame by frame",
+        "Profiles",
+        "slider",
+        "<svg",
+    ):
+        assert word in html.replace("range", "slider")
+    assert not list(tmp_path.glob(".*progress*"))
+    again = command(shots, "--reference", shots, "-o", out)
+    assert again.returncode == 2
+    assert "exists already" in again.stderr
+
+
+def test_the_page_opens_in_a_browser(tmp_path):
+    """Headless Chromium draws the page: its text is there, and its script has no error."""
+    browser = next(
+        (b for name in ("chromium", "chromium-browser", "google-chrome", "chrome") if (b := shutil.which(name))), None
+    )
+    if browser is None:
+        pytest.skip("no Chromium here to look at the page with")
+    from tune.report import plot
+
+    page = tmp_path / "page.html"
+    page.write_text(f"<body>{plot([('a', [0, 1, 2], [3.0, 1.0, 2.0])], title='curve')}</body>")
+    call = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", f"file://{page}"]
+    done = subprocess.run(call, capture_output=True, text=True, timeout=60)
+    assert "polyline" in done.stdout
