@@ -1,5 +1,6 @@
 """Strict by default: dtype and rank promotion are errors, float64 is on (tests choose their dtypes themselves)."""
 
+import os
 from pathlib import Path
 
 import jax
@@ -8,6 +9,11 @@ import pytest
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Commands that tests start compile quickly rather than well; this process has read its own flags by now.
+jax.devices()
+QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
