@@ -50,6 +50,7 @@ def step(
     Raises:
         SvgfError: shapes or dtypes that do not fit together.
     """
+    history, frame = jax.tree.map(jnp.asarray, (history, frame))
     check_frame(frame)
     params = check_params(params, config, dtype=frame.radiance.dtype)
     floor = at_level(params, 0).albedo_floor
