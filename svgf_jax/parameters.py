@@ -34,7 +34,7 @@ PRESETS: dict[str, tuple[Params, Config]] = {
         Config(levels=4, feedback_level=1),
     ),
     "adaptive": (
-        Params(sigma_luminance=(8.0, 6.0, 4.0, 3.0, 2.0), short_history_boost=4.0),
+        Params(alpha=0.3, sigma_luminance=(12.0, 8.0, 3.5, 2.5, 1.5), short_history_boost=6.0),
         Config(light_cell=4),
     ),
 }

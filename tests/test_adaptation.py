@@ -234,7 +234,7 @@ def test_a_step_of_the_light_is_followed_at_once(noise, samples, factor):
 @pytest.mark.parametrize("noise", list(NOISES))
 @pytest.mark.parametrize("samples", [1, 4])
 def test_steady_noise_is_not_taken_for_change(noise, samples):
-    """The history is nearly as smooth as without the stage: mostly above 90 % of its effective length, by its variance."""
+    """By its variance the history is nearly as long as without the stage: 85 % on this small wall, 91 % and more on a larger one."""
     _, with_stage = respond(noise, samples, 2.0)
     _, without = respond(noise, samples, 2.0, CONFIG._replace(light_cell=0))
     assert without.var() / with_stage.var() > 0.85
@@ -250,7 +250,8 @@ def test_steps_and_scan_agree_and_bad_pixels_stay_out():
         history = sj.init(frame) if history is None else history
         history, output = bridge.jitted_step(CONFIG, bridge.QUICK)(history, frame, params=PARAMS)
         np.testing.assert_allclose(output.image, scanned.image[t], rtol=1e-5, atol=1e-5)
-        assert np.isfinite(output.illumination).all() and np.isfinite(history.moments).all()
+        assert np.isfinite(output.illumination).all()
+        assert np.isfinite(history.moments).all()
 
 
 def test_it_is_differentiable_in_its_parameters():
@@ -263,7 +264,7 @@ def test_it_is_differentiable_in_its_parameters():
         return jnp.sum(jnp.tanh(output.illumination))
 
     names = ("light_gain_threshold", "light_offset_threshold", "light_sigma_normal", "alpha")
-    values = tuple(jnp.asarray(v, jnp.float64) for v in (1.6, 2.6, 64.0, 0.3))
+    values = tuple(jnp.asarray(v, jnp.float64) for v in (1.4, 2.1, 64.0, 0.3))
     reverse = jax.jit(jax.grad(error), compiler_options=dict(bridge.QUICK))(values)
     forward = jax.jit(jax.jacfwd(error), compiler_options=dict(bridge.QUICK))(values)
     assert all(np.isfinite(g) for g in reverse)
