@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from svgf_jax import Config, Params, SvgfError, __version__, save_params
+from svgf_jax import Config, Params, __version__, save_params
 from svgf_jax.commands import terminal
 from svgf_jax.metrics import Scores
 from tune.evaluate import Measured, measure, worse
@@ -223,20 +223,12 @@ def _print(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
     table = Table(box=SIMPLE)
     for i, head in enumerate(heads):
-        table.add_column(head, justify="left" if i == 0 else "right")
+        table.add_column(head, justify="left" if i == 0 else "right", no_wrap=i > 0)
     for row in rows:
         table.add_row(*map(Text, row))
-    Console(stderr=True).print(table)
+    Console(stderr=True, width=None if sys.stderr.isatty() else 140).print(table)
 
 
 def _numbers(scores: Scores) -> dict[str, float]:
     """Without what was not measured: TOML has no place for it."""
     return {name: float(value) for name, value in scores._asdict().items() if np.isfinite(value)}
-
-
-def check_writable(path: Path) -> None:
-    """Raise SvgfError unless `path` can be a folder of results."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SvgfError(f"{path}: can't be made ({error.strerror or error}); choose another folder") from None

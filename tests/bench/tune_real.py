@@ -3,6 +3,7 @@
 Fits see a window of each frame, so that a run takes minutes; scores are of whole frames, all of them.
 
     python tests/bench/tune_real.py scalar:cornell-dolly+gallery-pan level:cornell-dolly ...   (kind:sequences to tune on)
+    python tests/bench/tune_real.py steady:cornell-dolly+lights-flicker          (scalar, the temporal error at weight 1.5)
     python tests/bench/tune_real.py noisy:cornell-dolly clean:cornell-dolly       (8 frames: second noisy render, reference)
     python tests/bench/tune_real.py loo                                                        (scalar, each pair of sequences)
 
@@ -103,7 +104,7 @@ def main(arguments: list[str]) -> None:
         arguments = [f"scalar:{'+'.join(name for name in SEQUENCES if name != left)}" for left in SEQUENCES]
     for argument in arguments:
         kind, _, names = argument.partition(":")
-        keep(argument, tuned(kind, names.split("+")))
+        keep(argument, tuned(kind, names.split("+"), **({"temporal": 1.5} if kind == "steady" else {})))
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def trial_point(frames: int) -> dict:
     results = {}
     filter_only = lambda: [None for _ in filtered(shot, params, config)]  # noqa: E731
     filter_only()
-    for n in (1, 4, 8):
+    for n in (1, 8):
         names = (
             "alpha",
             "sigma_luminance",

@@ -1,0 +1,77 @@
+"""The page about a fit, without fitting anything, and the words about it."""
+
+import numpy as np
+import pytest
+
+from svgf_jax import Config, Params
+from svgf_jax.metrics import Scores
+from tune.evaluate import Measured, worse
+from tune.explore import Profile, Sensitivity, write_maps
+from tune.fitting import Fit, Iteration
+from tune.free import choose, to_free
+from tune.knowledge import learn
+from tune.report import plot, write_report
+
+
+def made_fit():
+    coordinates = choose(Params(), Config(), names=["alpha", "sigma_luminance[1]", "max_history"])
+    y = to_free(coordinates.start, coordinates) + 0.1
+    rng = np.random.default_rng(0)
+    rows = np.column_stack([rng.normal(size=(500, 2)), np.zeros(500), 0.1 * rng.normal(size=500)])
+    triangle = np.linalg.qr(rows, mode="r")
+    knowledge = learn(triangle, np.zeros((3, 3)), 500, y, coordinates)
+    trials = tuple(Iteration(0, i, 1.0 / (i + 1), i != 2, np.array([0.2, 4.0, 32.0]), 1.0) for i in range(4))
+    return Fit(Params(), Config(), coordinates, y, 0.25, trials, True, "converged: <done>", knowledge, ("a note",))
+
+
+def test_standard_errors_are_those_of_the_textbook():
+    """Independent rows, known noise: the diagonal of sigma^2 (J'J)^-1; a column of zeros is undetermined."""
+    coordinates = choose(Params(), Config(), names=["sigma_depth", "sigma_normal", "max_history"])
+    y = to_free(coordinates.start, coordinates)
+    rng = np.random.default_rng(1)
+    jacobian = np.column_stack([rng.normal(size=4000), rng.normal(size=4000), np.zeros(4000)])
+    jacobian[:, 1] += 3 * jacobian[:, 0]
+    residual = 0.1 * rng.normal(size=4000)
+    knowledge = learn(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"), np.zeros((3, 3)), 4000, y, coordinates)
+    covariance = 0.01 * np.linalg.inv(jacobian[:, :2].T @ jacobian[:, :2])
+    np.testing.assert_allclose(knowledge.relative_errors[:2], np.sqrt(np.diag(covariance)), rtol=0.05)
+    assert knowledge.undetermined == ("max_history",)
+    correlation = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
+    assert knowledge.correlations[0, 1] == pytest.approx(correlation, rel=1e-6)
+    assert np.isinf(knowledge.standard_errors[2])
+
+
+def test_numbers_that_make_up_for_each_other_are_named():
+    coordinates = choose(Params(), Config(), names=["sigma_depth", "depth_epsilon"])
+    column = np.random.default_rng(0).normal(size=(300, 1))
+    rows = np.hstack([column, column + 1e-3 * np.random.default_rng(1).normal(size=(300, 1)), 0.1 * column[::-1]])
+    y = to_free(coordinates.start, coordinates)
+    knowledge = learn(np.linalg.qr(rows, mode="r"), np.zeros((2, 2)), 300, y, coordinates)
+    assert knowledge.entangled == (("sigma_depth", "depth_epsilon"),)
+
+
+def test_the_page_holds_everything_and_escapes_it(tmp_path):
+    fit = made_fit()
+    maps = Sensitivity(np.ones((4, 6)), np.random.default_rng(0).normal(size=(3, 4, 6)))
+    curve = Profile("alpha", np.array([0.1, 0.2, 0.4]), np.array([1.0, 0.5, 0.8]))
+    page = tmp_path / "page.html"
+    write_report(page, fit, Params(), Config(), [], [curve], maps, ["worse & worse"])
+    text = page.read_text()
+    for wanted in ("converged: &lt;done&gt;", "worse &amp; worse", "a note", "undetermined", "loss over log10 alpha", "data:image/png"):
+        assert wanted in text
+    assert "src=\"http" not in text
+    channels = write_maps(tmp_path / "maps", fit, maps)
+    assert channels.name == "sensitivity.exr"
+
+
+def test_plots_take_what_is_not_finite_and_what_is_constant():
+    assert "nan" not in plot([("a", [0, 1, 2], [1.0, float("nan"), 1.0])], title="t")
+    assert plot([("a", [0], [float("nan")])], title="t") == ""
+
+
+def test_worse_is_worse():
+    scores = [Measured("s", (), Scores(psnr, 0.0, 0.0, 0.0, 0.0)) for psnr in (40.0, 39.9, float("nan"))]
+    assert worse(scores[1], scores[0]) is None
+    assert "39.90" in str(worse(scores[0], scores[1], tolerance=0.05))
+    assert worse(scores[0], scores[1], tolerance=0.2) is None
+    assert worse(scores[0], scores[2]) is not None
