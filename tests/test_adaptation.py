@@ -234,7 +234,7 @@ def test_a_step_of_the_light_is_followed_at_once(noise, samples, factor):
 @pytest.mark.parametrize("noise", list(NOISES))
 @pytest.mark.parametrize("samples", [1, 4])
 def test_steady_noise_is_not_taken_for_change(noise, samples):
-    """By its variance the history is nearly as long as without the stage: 85 % on this small wall, 91 % and more on a larger one."""
+    """By its variance the history is nearly as long as without the stage: 85 % here, 91 % on a larger wall."""
     _, with_stage = respond(noise, samples, 2.0)
     _, without = respond(noise, samples, 2.0, CONFIG._replace(light_cell=0))
     assert without.var() / with_stage.var() > 0.85
