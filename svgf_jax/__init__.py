@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from svgf_jax.accumulation import Accumulated as Accumulated
     from svgf_jax.accumulation import accumulate as accumulate
     from svgf_jax.atrous import atrous_filter as atrous_filter
     from svgf_jax.atrous import atrous_level as atrous_level
@@ -15,7 +16,10 @@ if TYPE_CHECKING:
     from svgf_jax.color import remodulate as remodulate
     from svgf_jax.color import tonemap as tonemap
     from svgf_jax.demo import sample as sample
+    from svgf_jax.edges import Guides as Guides
+    from svgf_jax.edges import depth_gradient as depth_gradient
     from svgf_jax.edges import edge_weight as edge_weight
+    from svgf_jax.edges import guides_of as guides_of
     from svgf_jax.frames import load_sequence as load_sequence
     from svgf_jax.frames import open_source as open_source
     from svgf_jax.frames import read_frame as read_frame
@@ -43,11 +47,11 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "accumulation": ["accumulate"],
+    "accumulation": ["Accumulated", "accumulate"],
     "atrous": ["atrous_filter", "atrous_level"],
     "color": ["demodulate", "luminance", "remodulate", "tonemap"],
     "demo": ["sample"],
-    "edges": ["edge_weight"],
+    "edges": ["Guides", "depth_gradient", "edge_weight", "guides_of"],
     "frames": ["load_sequence", "open_source", "read_frame"],
     "modulation": ["modulate"],
     "parameters": ["load_params", "preset", "save_params"],

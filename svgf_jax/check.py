@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from svgf_jax.types import Config, Frame, Params, SvgfError
+from svgf_jax.types import Config, Frame, History, Params, SvgfError
 
 
 def check_frame(frame: Frame) -> None:
@@ -41,8 +41,42 @@ def check_frame(frame: Frame) -> None:
             )
 
 
+def check_history(history: History, frame: Frame) -> None:
+    """Raise `SvgfError` unless the history belongs to frames of this size, dtype and number of signals."""
+    signals, height, width, _ = frame.radiance.shape
+    shapes = {
+        "illumination": (signals, height, width, 3),
+        "moments": (signals, height, width, 2),
+        "history_length": (height, width),
+        "depth": (height, width),
+        "normal": (height, width, 3),
+        "object_id": (height, width),
+    }
+    for name, leaf in history._asdict().items():
+        dtype = jnp.int32 if name == "object_id" else frame.radiance.dtype
+        if tuple(leaf.shape) != shapes[name] or leaf.dtype != dtype:
+            raise SvgfError(
+                f"the history's {name} is {leaf.dtype} {tuple(leaf.shape)}; wanted {jnp.dtype(dtype)} {shapes[name]} for "
+                "this frame. A history belongs to one sequence: start another with init(frame)"
+            )
+
+
+def check_sequence(frames: Frame) -> None:
+    """Raise `SvgfError` unless the arrays have a leading T of one length >= 1."""
+    if len(frames.radiance.shape) != 5:
+        raise SvgfError(
+            f"radiance has shape {tuple(frames.radiance.shape)}; wanted [T, S, H, W, 3], T frames of S signals. "
+            "For one frame call step, or add the leading T: jax.tree.map(lambda a: a[None], frame)"
+        )
+    lengths = {name: array.shape[0] if array.shape else 0 for name, array in frames._asdict().items()}
+    if len(set(lengths.values())) != 1 or 0 in lengths.values():
+        raise SvgfError(f"the frames' arrays have lengths {lengths}; wanted one length T >= 1 for all")
+
+
 def check_params(params: Params, config: Config, *, dtype) -> Params:
     """The parameters as arrays of `dtype`; raise `SvgfError` unless each is a scalar or has one value per level."""
+    if config.levels < 0 or config.feedback_level < -1 or config.light_cell < 0:
+        raise SvgfError(f"{config}; wanted levels >= 0, feedback_level >= -1, light_cell >= 0")
     arrays = Params(*(jnp.asarray(leaf, dtype) for leaf in params))
     for name, leaf in arrays._asdict().items():
         if leaf.ndim != 0 and leaf.shape != (max(config.levels, 1),):

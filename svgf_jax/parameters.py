@@ -39,26 +39,26 @@ PRESETS: dict[str, tuple[Params, Config]] = {
     ),
 }
 
-# Where each number must lie: (least, most), open ends excluded.
-_POSITIVE = (0.0, math.inf)
+# Where each number may lie: (least, most), both included; infinity is not a number.
+_NOT_NEGATIVE = (0.0, math.inf)
 BOUNDS: dict[str, tuple[float, float]] = {
     "alpha": (0.0, 1.0),
     "alpha_moments": (0.0, 1.0),
-    "sigma_depth": _POSITIVE,
-    "sigma_normal": _POSITIVE,
-    "sigma_luminance": _POSITIVE,
+    "sigma_depth": _NOT_NEGATIVE,
+    "sigma_normal": _NOT_NEGATIVE,
+    "sigma_luminance": _NOT_NEGATIVE,
     "short_history_boost": (1.0, math.inf),
     "max_history": (1.0, math.inf),
-    "albedo_floor": _POSITIVE,
-    "depth_epsilon": _POSITIVE,
-    "luminance_epsilon": _POSITIVE,
-    "reproject_depth": _POSITIVE,
+    "albedo_floor": (1e-9, math.inf),
+    "depth_epsilon": _NOT_NEGATIVE,
+    "luminance_epsilon": _NOT_NEGATIVE,
+    "reproject_depth": _NOT_NEGATIVE,
     "reproject_normal": (-1.0, 1.0),
-    "kernel_near": _POSITIVE,
-    "kernel_far": _POSITIVE,
-    "light_gain_threshold": _POSITIVE,
-    "light_offset_threshold": _POSITIVE,
-    "light_sigma_normal": _POSITIVE,
+    "kernel_near": _NOT_NEGATIVE,
+    "kernel_far": _NOT_NEGATIVE,
+    "light_gain_threshold": _NOT_NEGATIVE,
+    "light_offset_threshold": _NOT_NEGATIVE,
+    "light_sigma_normal": _NOT_NEGATIVE,
 }
 _MAX_LEVELS = 12
 

@@ -9,7 +9,7 @@ from jax import lax
 from svgf_jax.accumulation import accumulate
 from svgf_jax.adaptation import follow_light
 from svgf_jax.atrous import atrous_filter
-from svgf_jax.check import check_frame, check_params
+from svgf_jax.check import check_frame, check_history, check_params, check_sequence
 from svgf_jax.color import demodulate
 from svgf_jax.modulation import modulate
 from svgf_jax.reprojection import reproject
@@ -20,6 +20,7 @@ from svgf_jax.variance import estimate_variance
 
 def init(frame: Frame) -> History:
     """The empty history that a sequence starts with. Only the shapes and the dtype of `frame` matter."""
+    check_frame(frame)
     signals, height, width, _ = frame.radiance.shape
     dtype = frame.radiance.dtype
     return History(
@@ -52,6 +53,7 @@ def step(
     """
     history, frame = jax.tree.map(jnp.asarray, (history, frame))
     check_frame(frame)
+    check_history(history, frame)
     params = check_params(params, config, dtype=frame.radiance.dtype)
     floor = at_level(params, 0).albedo_floor
 
@@ -99,6 +101,7 @@ def denoise(
     Returns:
         The history after the last frame (to go on with), and the outputs with a leading T.
     """
+    check_sequence(frames)
     if history is None:
         history = init(jax.tree.map(lambda a: a[0], frames))
     # Recompute a frame in reverse mode rather than store what happened inside it.

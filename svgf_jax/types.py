@@ -50,7 +50,7 @@ class History(NamedTuple):
     """What the next frame needs of the past.
 
     Attributes:
-        illumination: `[S, H, W, 3]`, accumulated and once-filtered demodulated radiance.
+        illumination: `[S, H, W, 3]`, accumulated demodulated radiance, filtered up to `Config.feedback_level`.
         moments: `[S, H, W, 2]`, accumulated first and second moment of the illumination's luminance.
         history_length: `[H, W]`, frames accumulated, a real number in [0, max_history]; 0 = no history.
         depth, normal, object_id: the sanitised guides of the frame that this history ends with.
@@ -127,20 +127,20 @@ class Params(NamedTuple):
     Falcor's SVGFPass has other names for some: Alpha, MomentsAlpha, PhiNormal (sigma_normal), PhiColor (sigma_luminance).
 
     Attributes:
-        alpha: least weight of the new frame in the accumulated illumination, in (0, 1].
+        alpha: least weight of the new frame in the accumulated illumination, in [0, 1].
         alpha_moments: the same for the moments.
-        sigma_depth: depth edge-stopping, in units of the depth that the local slope predicts, > 0.
+        sigma_depth: depth edge-stopping, in units of the depth that the local slope predicts, >= 0.
         sigma_normal: normal edge-stopping, exponent of the cosine, >= 0.
-        sigma_luminance: luminance edge-stopping, in standard deviations, > 0.
+        sigma_luminance: luminance edge-stopping, in standard deviations, >= 0.
         short_history_boost: factor on the spatial variance estimate at history length 1, >= 1.
         max_history: cap of the history length, in frames, >= 1.
-        albedo_floor: smallest albedo divided by, > 0.
-        depth_epsilon: depth tolerance relative to depth, > 0.
-        luminance_epsilon: luminance tolerance, > 0.
-        reproject_depth: largest relative depth difference of a consistent previous pixel, > 0.
-        reproject_normal: smallest cosine between the normals of consistent pixels, in [-1, 1).
-        kernel_near: a-trous tap at distance 1 relative to the centre tap (B3 spline: 2/3), > 0.
-        kernel_far: a-trous tap at distance 2 relative to the centre tap (B3 spline: 1/6), > 0.
+        albedo_floor: smallest albedo divided by, >= 1e-9.
+        depth_epsilon: depth tolerance relative to depth, >= 0.
+        luminance_epsilon: luminance tolerance, >= 0.
+        reproject_depth: largest relative depth difference of a consistent previous pixel, >= 0.
+        reproject_normal: smallest cosine between the normals of consistent pixels, in [-1, 1].
+        kernel_near: a-trous tap at distance 1 relative to the centre tap (B3 spline: 2/3), >= 0.
+        kernel_far: a-trous tap at distance 2 relative to the centre tap (B3 spline: 1/6), >= 0.
         light_gain_threshold: standard errors by which the light over a wide neighbourhood must differ from the history's
             before the history is scaled to it, > 0. This and the next two are read only where `light_cell` > 0.
         light_offset_threshold: the same over a narrow neighbourhood, before the rest of the difference is added, > 0.
