@@ -20,7 +20,9 @@ def compare_sequences(
     with_flip: bool = False,
     warn: Callable[[str], None] = lambda text: None,
 ) -> Iterator[tuple[int, Scores]]:
-    """(frame number, scores) of each frame that both sequences have, in order; `warn` hears of those that one lacks.
+    """(frame number, scores) of each frame that both sequences have, in order.
+
+    `warn` hears of frames that one of them lacks, or both, and of pixels that are not finite.
 
     Folders, patterns or files as `find_sequence` takes them; of a folder's sequences, `frame` is taken for `out` and
     `ref` for `reference`. Raises SvgfError: not found, no frame in common, unreadable, of different sizes, no colour.
@@ -38,6 +40,9 @@ def compare_sequences(
         )
     if alone := ours.keys() ^ theirs.keys():
         warn(f"frames {format_range(alone)} are in only one of the sequences and are left out")
+    wanted = {number for sequence in sequences for number, _ in sequence.files}
+    if frames is not None and (nowhere := wanted - ours.keys() - theirs.keys()):
+        warn(f"frames {format_range(nowhere)} are in neither of the sequences")
 
     def read(number: int) -> tuple[np.ndarray, np.ndarray]:
         image, wanted = read_radiance(ours[number]), read_radiance(theirs[number])
@@ -52,5 +57,8 @@ def compare_sequences(
     for number, pair in zip(common, read_ahead(read, common, threads=1), strict=True):
         if previous is not None and previous[0].shape != pair[0].shape:
             previous = None
+        for image, where in zip(pair, ("", " in the reference"), strict=True):
+            if bad := int((~np.isfinite(image)).any(-1).sum()):
+                warn(f"frame {number}: {bad} pixel{'s' * (bad != 1)} not finite{where}")
         yield number, score(*pair, previous=previous, with_flip=with_flip)
         previous = pair

@@ -2,11 +2,11 @@
 
 All take scene-linear radiance, `image` and `reference` of shape `[H, W, C]`. PSNR, SSIM and the temporal error look at
 `display(x) = x / (1 + x)` with x clamped at 0, so that a few very bright pixels do not decide the score; every mean
-runs over pixels and channels alike. A nan in an image makes its scores nan.
+runs over pixels and channels alike. A nan in an image makes its scores nan, and with them those of its sequence.
 """
 
 import importlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +33,9 @@ class Scores(NamedTuple):
     ssim: float
     temporal: float
     flip: float
+
+
+_TEMPORAL = Scores._fields.index("temporal")
 
 
 def display(image: np.ndarray) -> np.ndarray:
@@ -90,10 +93,12 @@ def temporal_error(
 def flip(image: np.ndarray, reference: np.ndarray) -> float:
     """Mean HDR-FLIP (Andersson et al. 2021) in [0, 1], lower is better, at FLIP's default viewing distance.
 
-    Three-channel images; negative values count as 0. Needs the extra `flip` (NVIDIA's `flip-evaluator`); `SvgfError`
-    without it.
+    Three-channel images; negative values count as 0; nan where either holds a nan. Needs the extra `flip`
+    (NVIDIA's `flip-evaluator`); `SvgfError` without it.
     """
     _check_shapes(image, reference)
+    if np.isnan(image).any() or np.isnan(reference).any():
+        return float("nan")
     _, mean, _ = _flip_evaluator().evaluate(_for_flip(reference), _for_flip(image), "HDR", applyMagma=False)
     return float(mean)
 
@@ -123,17 +128,33 @@ def score(
 def mean_scores(scores: Iterable[Scores]) -> Scores:
     """The scores of a sequence from its frames': the plain mean, but for `temporal` the root mean square.
 
-    Frames without a score (nan) do not count; nan where no frame has it. The root mean square over frames of an RMSE is
-    the RMSE over all pixels of the sequence.
+    Frames that have no such score (`absent`) do not count; nan where no frame has it, and where a frame is broken. The
+    root mean square over frames of an RMSE is the RMSE over all pixels of the sequence.
     """
-    table = np.asarray(list(scores), np.float64)
-    if not table.size:
+    rows = list(scores)
+    if not rows:
         raise SvgfError("mean_scores got no frames; it wants the scores of at least one frame.")
-    temporal = Scores._fields.index("temporal")
-    table[:, temporal] **= 2
-    known = [column[~np.isnan(column)] for column in table.T]
+    table = np.asarray(rows, np.float64)
+    table[:, _TEMPORAL] **= 2
+    known = [column[~none] for column, none in zip(table.T, absent(rows).T, strict=True)]
     means = Scores(*(float(np.mean(column)) if column.size else float("nan") for column in known))
     return means._replace(temporal=float(np.sqrt(means.temporal)))
+
+
+def absent(scores: Sequence[Scores]) -> np.ndarray:
+    """`[N, 5]` bool: which scores of consecutive frames do not exist, unlike those that are nan for the pixels' sake.
+
+    The PSNR always exists, so that where it is nan the image is broken, and with it its other scores and the next
+    frame's temporal error. The first frame has no temporal error in any case.
+    """
+    table = np.asarray(scores, np.float64).reshape(-1, len(Scores._fields))
+    broken = np.isnan(table[:, 0])
+    blamed = np.repeat(broken[:, None], table.shape[1], axis=1)
+    blamed[1:, _TEMPORAL] |= broken[:-1]
+    blamed[:1, _TEMPORAL] = False
+    blamed[:, 1] = True
+    blamed[:, 4] &= ~np.isnan(table[:, 4]).all()  # not asked for
+    return np.isnan(table) & ~blamed
 
 
 def _window_mean(plane: np.ndarray) -> np.ndarray:

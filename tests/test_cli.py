@@ -328,6 +328,28 @@ def test_compare_prints_and_saves_all_scores(denoised, references, tmp_path):
     assert "--overwrite" in done.stderr
 
 
+def test_compare_shows_and_tells_of_broken_frames(references, tmp_path):
+    write_shot(tmp_path / "out", [2, 3, 4])
+    path = tmp_path / "out" / "shot.0003.exr"
+    image = exr.read(path)
+    image.channels["direct.R"][2, 3:5] = np.nan
+    exr.write(path, image)
+    done = command("compare", "out", references, "--frames", "2-6", "--csv", "a.csv", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "frame 3: 2 pixels not finite" in done.stderr
+    assert "frames 5-6 are in neither of the sequences" in done.stderr
+    with (tmp_path / "a.csv").open() as file:
+        rows = {row["frame"]: row for row in csv.DictReader(file)}
+    assert [rows[i]["psnr"] for i in ("3", "mean")] == ["nan", "nan"]
+    assert [rows[i]["temporal"] for i in "234"] == ["", "nan", "nan"]
+    assert float(rows["4"]["relmse"]) == 0
+    assert "flip" in rows["2"]
+    assert "FLIP" not in done.stdout
+    table = {line.split()[0]: line.split() for line in done.stdout.splitlines() if line.strip()}
+    assert table["3"] == ["3", *["nan"] * 4]
+    assert table["mean"] == ["mean", *["nan"] * 4]
+
+
 def test_compare_with_itself_is_perfect(references):
     pytest.importorskip("flip_evaluator")
     done = command("compare", references, references, "--frames", "1-2", "--flip")

@@ -70,6 +70,26 @@ def test_sequence_scores_pool_the_temporal_error():
     assert math.isnan(mean.flip)
 
 
+def test_a_broken_frame_breaks_the_scores_of_its_sequence():
+    broken = IMAGE.copy()
+    broken[0, 0, 0] = math.nan
+    for order in ([IMAGE, broken, IMAGE], [broken, IMAGE], [IMAGE, broken]):
+        scores = [
+            metrics.score(image, REFERENCE, previous=(order[i - 1], REFERENCE) if i else None)
+            for i, image in enumerate(order)
+        ]
+        assert all(math.isnan(value) for value in metrics.mean_scores(scores))
+        none = metrics.absent(scores)
+        assert none[:, 4].all()  # FLIP was not asked for
+        assert none[0, 3]
+        assert not none[1:, 3].any()
+        assert not none[:, :3].any()
+
+
+def test_flip_of_a_broken_image_is_nan():
+    assert math.isnan(metrics.flip(np.full((4, 4, 3), math.nan), REFERENCE[:4, :4]))
+
+
 def test_flip_orders_images():
     pytest.importorskip("flip_evaluator")
     near = REFERENCE * 1.01

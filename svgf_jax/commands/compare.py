@@ -2,8 +2,7 @@
 
 import csv
 import io
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -71,26 +70,22 @@ def compare(
 
 
 def print_scores(title: str, rows: Mapping[str, "Scores"]) -> None:
-    """A table on the standard output, the row `mean` set apart; columns without any score are left out."""
+    """A table on the standard output, the row `mean` set apart; columns that no row has are left out."""
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    names = [name for name in COLUMNS if not all(math.isnan(getattr(score, name)) for score in rows.values())]
+    cells = _cells(rows, lambda name, value: COLUMNS[name][1].format(value))
+    names = [name for name in COLUMNS if any(row[name] for row in cells.values())]
     table = Table(box=SIMPLE)
     table.add_column(Text(title))
     for name in names:
         table.add_column(COLUMNS[name][0], justify="right")
-    for label, score in rows.items():
+    for label, row in cells.items():
         if label == "mean":
             table.add_section()
-        values = [getattr(score, name) for name in names]
-        cells = [
-            "" if math.isnan(value) else COLUMNS[name][1].format(value)
-            for name, value in zip(names, values, strict=True)
-        ]
-        table.add_row(Text(label), *cells)
+        table.add_row(Text(label), *(row[name] for name in names))
     Console().print(table)
 
 
@@ -98,9 +93,20 @@ def _to_csv(rows: Mapping[str, "Scores"]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["frame", *COLUMNS])
-    for label, score in rows.items():
-        writer.writerow([label, *("" if math.isnan(value) else value for value in score)])
+    for label, row in _cells(rows, lambda _, value: repr(value)).items():
+        writer.writerow([label, *row.values()])
     return text.getvalue()
+
+
+def _cells(rows: Mapping[str, "Scores"], show: Callable[[str, float], str]) -> dict[str, dict[str, str]]:
+    """By row and column: the score as text, "nan" for one that broken pixels spoil, "" for one that does not exist."""
+    from svgf_jax.metrics import absent
+
+    none = absent(list(rows.values()))
+    return {
+        label: {name: "" if none[i, k] else show(name, float(score[k])) for k, name in enumerate(score._fields)}
+        for i, (label, score) in enumerate(rows.items())
+    }
 
 
 def _save(path: Path, text: str) -> None:
