@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from svgf_jax.color import luminance_of_planes
+from svgf_jax.color import largest_luminance, luminance_of_planes
 from svgf_jax.sampling import in_strips, planes, stack_planes
 from svgf_jax.types import Frame, Params, Reprojected, at_level
 
@@ -34,7 +34,7 @@ def accumulate(illumination: Array, previous: Reprojected, frame: Frame, *, para
         length = jnp.where(valid, jnp.minimum(previous_length + 1.0, scalars.max_history), 1.0)
         weight = _blend_weight(scalars.alpha, length, valid)
         weight_moments = _blend_weight(scalars.alpha_moments, length, valid)
-        lumas = [jnp.minimum(luminance_of_planes(*color), _largest_luminance(length.dtype)) for color in colors]
+        lumas = [jnp.minimum(luminance_of_planes(*color), largest_luminance(length.dtype)) for color in colors]
         moments = [(luma, luma * luma) for luma in lumas]
         blended = (
             jax.tree.map(lambda old, new: _blend(old, new, weight), previous_colors, colors),
@@ -61,8 +61,3 @@ def _blend_weight(alpha: Array | float, length: Array, valid: Array) -> Array:
 
 def _blend(previous: Array, current: Array, weight: Array) -> Array:
     return (1.0 - weight) * previous + weight * current
-
-
-def _largest_luminance(dtype) -> float:
-    """Squares of luminances below this, and sums of them with weights, stay finite."""
-    return float(jnp.finfo(dtype).max) ** 0.5 / 2**6

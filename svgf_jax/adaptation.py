@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from svgf_jax.color import luminance_of_planes
+from svgf_jax.color import largest_luminance, luminance_of_planes
 from svgf_jax.edges import Guides, depth_gradient, geometry_exponent, guides_of
 from svgf_jax.sampling import planes, square_offsets, sum_over_taps
 from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
@@ -184,7 +184,7 @@ def _gather(guides, slope, known, current, history, *, size: int, scalars: Param
 
 
 def _moments_of(current: Color, history: Color) -> Means:
-    current, history = jax.tree.map(lambda c: jnp.minimum(c, _largest(c.dtype)), (current, history))
+    current, history = jax.tree.map(lambda c: jnp.minimum(c, largest_luminance(c.dtype)), (current, history))
     l, prev_l = luminance_of_planes(*current), luminance_of_planes(*history)  # noqa: E741
     return Means(current, history, l * l, l * prev_l, prev_l * prev_l)
 
@@ -333,7 +333,7 @@ def _apply(cells: Cells, corrections, guides, slope, known, history, moments, *,
 
 def _correct(color: Color, moments: tuple[Array, Array], total: Correction, divisor: Array):
     c = jax.tree.map(lambda t: t / divisor, total)
-    most = _largest(divisor.dtype)
+    most = largest_luminance(divisor.dtype)
     corrected = tuple(
         jnp.clip(g * h + o, 0.0, jnp.maximum(h, most)) for g, h, o in zip(c.gain, color, c.offset, strict=True)
     )
@@ -341,8 +341,3 @@ def _correct(color: Color, moments: tuple[Array, Array], total: Correction, divi
     variance = jnp.minimum(c.keep * jnp.maximum(second - first * first, 0.0) + c.variance, most * most)
     first = jnp.clip(c.luminance_gain * first + luminance_of_planes(*c.offset), 0.0, most)
     return corrected, (first, variance + first * first)
-
-
-def _largest(dtype) -> float:
-    """Squares of numbers up to this, and sums of them with weights, stay finite."""
-    return float(jnp.finfo(dtype).max) ** 0.5 / 2**6

@@ -16,6 +16,11 @@ def luminance_of_planes(red: Array, green: Array, blue: Array) -> Array:
     return LUMINANCE[0] * red + LUMINANCE[1] * green + LUMINANCE[2] * blue
 
 
+def largest_luminance(dtype) -> float:
+    """Squares of luminances up to this, and sums of them with weights, stay finite."""
+    return float(jnp.finfo(dtype).max) ** 0.5 / 2**6
+
+
 def demodulate(radiance: Array, albedo: Array, *, albedo_floor: Array | float = 1e-3) -> Array:
     """Illumination: radiance / max(albedo, albedo_floor), per signal and channel.
 

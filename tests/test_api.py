@@ -63,7 +63,7 @@ def test_importing_the_package_does_not_import_jax():
 
 
 def frame_of_zeros(signals=1, height=3, width=4):
-    shapes = {name: (height, width) for name in svgf_jax.Frame._fields}
+    shapes = dict.fromkeys(svgf_jax.Frame._fields, (height, width))
     shapes |= {"radiance": (signals, height, width, 3), "albedo": (1, height, width, 3), "motion": (height, width, 2)}
     shapes |= {"emission": (height, width, 3), "normal": (height, width, 3)}
     types = {name: np.int32 if name == "object_id" else np.float32 for name in shapes}

@@ -73,7 +73,7 @@ MUTANTS = {
     ),
     "moments of the accumulated light": mutant(
         "accumulation",
-        "luminance_of_planes(*color), _largest_luminance(length.dtype)) for color in colors]",
+        "luminance_of_planes(*color), largest_luminance(length.dtype)) for color in colors]",
         "luminance_of_planes(*(_blend(o, c, weight) for o, c in zip(old, color))), 1e30)"
         " for old, color in zip(previous_colors, colors)]",
         "test_accumulate",
