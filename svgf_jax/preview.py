@@ -5,6 +5,7 @@ import os
 import shutil
 import uuid
 from collections.abc import Callable, Iterable, Sequence
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +22,24 @@ def tonemap(image: np.ndarray, *, exposure: float = 1.0) -> np.ndarray:
     Extended Reinhard (2002, eq. 4) on each channel, `x (1 + x / WHITE^2) / (1 + x)`, then the sRGB curve. `exposure` is
     a factor on the radiance, > 0. Negative and nan count as 0; everything from WHITE on is 255.
     """
-    if not (np.isfinite(exposure) and exposure > 0):
-        raise SvgfError(f"Got the exposure {exposure}; wanted a finite number above 0, for example 1 (no change) or 2.")
+    check_exposure(exposure)
     linear = np.clip(np.nan_to_num(np.asarray(image, np.float32)), 0, WHITE / exposure) * exposure
     curve = linear * (1 + linear / WHITE**2) / (1 + linear)
     srgb = np.where(curve <= 0.0031308, 12.92 * curve, 1.055 * np.maximum(curve, 0.0031308) ** (1 / 2.4) - 0.055)
     return (srgb * 255 + 0.5).astype(np.uint8)
+
+
+def check_exposure(exposure: float) -> None:
+    """Raise `SvgfError` for an exposure that `tonemap` does not take."""
+    if not (np.isfinite(exposure) and exposure > 0):
+        raise SvgfError(f"Got the exposure {exposure}; wanted a finite number above 0, for example 1 (no change) or 2.")
+
+
+def frame_rate(fps: float) -> Fraction:
+    """Frames per second as the fraction that a video stores (23.976 is 2997/125); `SvgfError` outside [0.1, 1000]."""
+    if not 0.1 <= fps <= 1000:
+        raise SvgfError(f"Got {fps} frames per second; wanted a number from 0.1 to 1000, for example 24 or 23.976.")
+    return Fraction(fps).limit_denominator(1001)
 
 
 def side_by_side(panels: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
@@ -53,12 +66,12 @@ def write_png(path: str | Path, picture: np.ndarray) -> None:
 
 
 def write_video(path: str | Path, pictures: Iterable[np.ndarray], *, fps: float = 24.0) -> None:
-    """Write `[H, W, 3]` uint8 pictures of one size as an MP4 (H.264), under a temporary name and then renamed.
+    """Write `[H, W, 3]` uint8 pictures of one size as an MP4 (H.264, BT.709), under a temporary name and then renamed.
 
     Holds one picture at a time. An odd width or height, which H.264 cannot store, is filled up by repeating the last
     row or column. Needs the extra `video` (PyAV); `SvgfError` without it, and where writing fails.
     """
-    av = _av()
+    av, rate = _av(), frame_rate(fps)
 
     def encode(temporary: str) -> None:
         with av.open(temporary, "w", format="mp4") as container:
@@ -67,9 +80,12 @@ def write_video(path: str | Path, pictures: Iterable[np.ndarray], *, fps: float 
                 height, width = picture.shape[:2]
                 even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
                 if stream is None:
-                    stream = container.add_stream("libx264", rate=round(fps), options={"crf": "16"})
+                    stream = container.add_stream("libx264", rate=rate, options={"crf": "16"})
                     stream.height, stream.width, stream.pix_fmt = *even.shape[:2], "yuv420p"
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")))
+                    coding = stream.codec_context  # 1 = BT.709, and the range of television
+                    coding.colorspace = coding.color_primaries = coding.color_trc = coding.color_range = 1
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+                container.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace="ITU709")))
             if stream is None:
                 raise SvgfError(f"There is no picture to put into the video {path}: wanted at least one frame.")
             container.mux(stream.encode())

@@ -74,10 +74,10 @@ def run(
     source: frames.Source,
     out: str | Path,
     *,
-    params: Params = Params(),  # noqa: B008 (immutable)
-    config: Config = Config(),  # noqa: B008
+    params: Params = Params(),
+    config: Config = Config(),
     preset: str = "",
-    options: WriteOptions = WriteOptions(),  # noqa: B008
+    options: WriteOptions = WriteOptions(),
     video: bool = False,
     fps: float = 24.0,
     resume: bool = False,
@@ -108,12 +108,15 @@ def run(
         pipeline: `(init, step)` in place of `svgf_jax.pipeline`'s.
 
     Raises:
-        SvgfError: unreadable or mismatching input, an unusable output folder, existing outputs, a checkpoint of another
-            computation, a full disk. What is complete stays, and `resume` continues from there.
+        SvgfError: an option out of range (before any work), unreadable or mismatching input, an unusable output folder,
+            existing outputs, a checkpoint of another computation, a full disk. What is complete stays, and `resume`
+            continues from there.
     """
     began = time.monotonic()
     if checkpoint_every < 1 or threads < 1:
         raise SvgfError(f"Got checkpoint_every {checkpoint_every} and threads {threads}; wanted at least 1 of each.")
+    preview.check_exposure(options.exposure)
+    preview.frame_rate(fps)
     if video:
         preview.require_video()
     provenance = outputs.attributes(os.path.abspath(source.sequence.name), preset=preset, params=params, config=config)

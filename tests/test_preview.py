@@ -75,6 +75,25 @@ def test_video_holds_all_frames_and_pads_odd_sizes(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
 
 
+def test_a_video_keeps_its_frame_rate_and_says_what_its_colours_mean(tmp_path):
+    av = pytest.importorskip("av")
+    picture = np.broadcast_to(np.array([200, 40, 0], np.uint8), (32, 32, 3))
+    preview.write_video(tmp_path / "a.mp4", [picture] * 3, fps=23.976)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert float(container.streams.video[0].average_rate) == pytest.approx(23.976, abs=1e-3)
+        frame = next(container.decode(video=0))
+    assert (int(frame.colorspace), int(frame.color_range)) == (1, 1)
+    shown = frame.reformat(format="rgb24", src_colorspace="ITU709").to_ndarray()
+    assert np.abs(shown.astype(int) - picture).max() <= 3
+
+
+@pytest.mark.parametrize("fps", [0, -1, np.nan, np.inf])
+def test_a_senseless_frame_rate_is_refused(tmp_path, fps):
+    pytest.importorskip("av")
+    with pytest.raises(SvgfError, match="frames per second"):
+        preview.write_video(tmp_path / "a.mp4", [np.zeros((8, 8, 3), np.uint8)], fps=fps)
+
+
 def test_video_of_nothing_or_nowhere_is_a_clear_error(tmp_path):
     pytest.importorskip("av")
     with pytest.raises(SvgfError, match="no picture"):

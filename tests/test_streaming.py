@@ -325,4 +325,10 @@ def test_senseless_options(shot, tmp_path):
         run(shot, tmp_path / "out", threads=0)
     with pytest.raises(SvgfError, match=r"no device 'tpu:3'.*cpu:0"):
         run(shot, tmp_path / "out", device="tpu:3")
+    for exposure in (-1.0, 0.0, np.nan):
+        with pytest.raises(SvgfError, match="exposure"):
+            run(shot, tmp_path / "out", options=WriteOptions(exposure=exposure))
+    for fps in (0.0, -1.0, np.nan):
+        with pytest.raises(SvgfError, match="frames per second"):
+            run(shot, tmp_path / "out", fps=fps)
     assert not (tmp_path / "out").exists()
