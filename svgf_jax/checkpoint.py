@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from svgf_jax import atomic
 from svgf_jax.types import History, SvgfError
 
 FOLDER = ".svgf-jax"
@@ -151,14 +152,10 @@ def _unusable(path: Path, error: Exception) -> SvgfError:
 
 
 def _replace(path: Path, write: Callable[[BinaryIO], Any]) -> None:
-    """Write a file under a temporary name, make it durable and rename it."""
-    temporary = path.with_name(f"{path.name}.tmp")  # one name: the folder is locked, and a killed run's is written over
+    """Write a file under a temporary name and rename it. One name: the folder is locked to other runs."""
     try:
-        with open(temporary, "wb") as file:
+        with atomic.replacing(path, unique=False) as temporary, temporary.open("wb") as file:
             write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
     except OSError as error:
         raise SvgfError(f"Could not write {path}: {error}. Check that the disk is not full.") from error
 

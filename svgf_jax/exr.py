@@ -8,10 +8,8 @@ apart and written back.
 Reading and writing may be called from several threads at once.
 """
 
-import contextlib
 import os
 import re
-import uuid
 from functools import cache
 from os import fspath
 from pathlib import Path
@@ -20,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from svgf_jax import atomic
 from svgf_jax.exr_layout import Part, PathName, Window, read_layout
 from svgf_jax.types import SvgfError
 
@@ -127,20 +126,13 @@ def write(path: PathName, image: Image, *, compression: str = "zip") -> tuple[st
     header["type"] = bindings.scanlineimage
     for key, (left, top, right, bottom) in (("dataWindow", image.data_window), ("displayWindow", image.display_window)):
         header[key] = (np.array([left, top], np.int32), np.array([right, bottom], np.int32))
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
-        temporary.touch()  # a missing folder or permission says so here, with its reason
-        bindings.File(header, channels).write(str(temporary))
-        read_layout(temporary)  # a full disk need not have raised
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        with atomic.replacing(path) as temporary:
+            bindings.File(header, channels).write(str(temporary))
+            read_layout(temporary)  # a full disk need not have raised
     except (OSError, RuntimeError, ValueError, TypeError, SvgfError) as error:
         reason = _write_failure(path, error)
         raise SvgfError(f"{path}: cannot be written ({reason}). Is the disk full or the folder read-only?") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
     return dropped
 
 

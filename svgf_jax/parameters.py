@@ -17,7 +17,6 @@ A parameter file is TOML:
 import difflib
 import math
 import os
-import tempfile
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,6 +24,7 @@ from typing import Any
 
 import tomli_w
 
+from svgf_jax import atomic
 from svgf_jax.types import Config, Params, SvgfError
 
 PRESETS: dict[str, tuple[Params, Config]] = {
@@ -110,12 +110,7 @@ def save_params(
     file = Path(path)
     text = to_toml(params, config, provenance=provenance)
     try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{file.name}.", suffix=".tmp", dir=file.parent)
-        with os.fdopen(handle, "w", encoding="utf-8") as out:
-            out.write(text)
-            out.flush()
-            os.fsync(out.fileno())
-        Path(temporary).replace(file)
+        atomic.write_text(file, text)
     except OSError as error:
         raise SvgfError(f"{file}: can't write the parameters: {error}") from None
 

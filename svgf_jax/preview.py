@@ -1,9 +1,7 @@
 """Pictures to look at: tone-mapped 8-bit images, labelled side by side, as PNG or MP4. No JAX."""
 
 import importlib
-import os
 import shutil
-import uuid
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -11,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from svgf_jax import atomic
 from svgf_jax.types import SvgfError
 
 WHITE = 4.0  # radiance that becomes full white (at exposure 1)
@@ -115,16 +114,11 @@ def _av():
 
 
 def _write_atomically(path: str | Path, write: Callable[[str], object], *failures: type[Exception]) -> None:
-    """Call `write(temporary name in the same folder)`, make it durable, rename it to `path`."""
-    temporary = str(Path(path).with_name(f".{Path(path).name}.{uuid.uuid4().hex[:8]}.tmp"))
+    """Call `write(temporary name in the same folder)` and rename that to `path`; `SvgfError` where it fails."""
     try:
-        write(temporary)
-        with open(temporary, "rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        with atomic.replacing(path) as temporary:
+            write(str(temporary))
     except (OSError, *failures) as error:
         raise SvgfError(
             f"Could not write {path}: {error}. Check that the folder exists, is writable and is not full."
         ) from error
-    finally:
-        Path(temporary).unlink(missing_ok=True)

@@ -7,6 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
+    {"atomic"},
     {"types"},
     {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check"},
     {"edges", "exr", "sanitation", "accumulation", "reprojection", "modulation", "sequences", "cameras"},
@@ -21,6 +22,7 @@ FLOORS = [
 ]
 STAGES = {"sanitation", "reprojection", "accumulation", "adaptation", "variance", "atrous"}
 NUMPY_ONLY = {
+    "atomic",
     "types",
     "parameters",
     "metrics",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from svgf_jax import atomic
 from svgf_jax.commands import terminal
 from svgf_jax.types import SvgfError
 
@@ -56,6 +57,8 @@ def compare(
     for path in (json_file, csv_file):
         if path is not None and path.exists() and not overwrite:
             raise SvgfError(f"{path} exists already; choose another name, or --overwrite.")
+        if path is not None:
+            _save(path, None)
     if flip:
         metrics.require_flip()
     pairs = compare_sequences(out, reference, frames=frames, with_flip=flip, warn=lambda text: terminal.warn([text]))
@@ -109,9 +112,13 @@ def _cells(rows: Mapping[str, "Scores"], show: Callable[[str, float], str]) -> d
     }
 
 
-def _save(path: Path, text: str) -> None:
+def _save(path: Path, text: str | None) -> None:
+    """Write a file, complete or not at all; None only asks whether that could be done."""
     try:
-        path.write_text(text)
+        if text is None:
+            atomic.require_writable(path)
+        else:
+            atomic.write_text(path, text)
     except OSError as error:
         raise SvgfError(
             f"Could not write {path}: {error.strerror or error}. Choose a folder that is writable."

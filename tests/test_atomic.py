@@ -1,0 +1,54 @@
+import os
+
+import pytest
+
+from svgf_jax import atomic
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("unique", [True, False])
+def test_a_file_appears_complete(tmp_path, unique):
+    with atomic.replacing(tmp_path / "a.txt", unique=unique) as temporary:
+        temporary.write_text("new")
+        assert temporary.parent == tmp_path
+        assert temporary.name.startswith(".a.txt.")
+        assert temporary.name.endswith(".tmp")
+        assert not (tmp_path / "a.txt").exists()
+    assert (tmp_path / "a.txt").read_text() == "new"
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
+    atomic.write_text(tmp_path / "a.txt", "old é\n")
+    with pytest.raises(OSError), atomic.replacing(tmp_path / "a.txt") as temporary:  # noqa: PT011 (any)
+        (temporary / "under a file").touch()
+    assert (tmp_path / "a.txt").read_bytes() == "old é\n".encode()
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_what_is_written_is_flushed_before_it_is_renamed(tmp_path, monkeypatch):
+    flushed = []
+    monkeypatch.setattr(os, "fsync", lambda _: flushed.append(names(tmp_path)))
+    atomic.write_text(tmp_path / "a.txt", "new")
+    assert len(flushed) == 1
+    assert "a.txt" not in flushed[0]
+
+
+def test_what_a_killed_process_left_is_written_over(tmp_path):
+    (tmp_path / ".a.txt.tmp").write_text("left over")
+    with atomic.replacing(tmp_path / "a.txt", unique=False) as temporary:
+        temporary.write_text("new")
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_what_cannot_be_written_is_known_before(tmp_path):
+    atomic.require_writable(tmp_path / "a.txt")
+    with pytest.raises(IsADirectoryError):
+        atomic.require_writable(tmp_path)
+    for do in (atomic.require_writable, lambda path: atomic.write_text(path, "")):
+        with pytest.raises(FileNotFoundError):
+            do(tmp_path / "nowhere" / "a.txt")
+    assert names(tmp_path) == []
