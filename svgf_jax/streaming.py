@@ -31,7 +31,8 @@ class FrameReport(NamedTuple):
         number: the frame number.
         status: "filtered", "held" (missing: the frame before it written again) or "skipped" (missing: nothing written).
         path: the output, None if skipped.
-        counts: pixels repaired on loading, before filtering and on writing, by reason; only those above 0.
+        counts: pixels repaired on loading, before filtering and on writing, by reason, and those of the output that are
+            `not_finite`, which should never happen; only those above 0.
         notes: anything else worth telling, as sentences.
     """
 
@@ -50,7 +51,7 @@ class Summary(NamedTuple):
         frames: frames in the sequence.
         resumed_at: how many of them an earlier run had done; 0 unless resumed.
         statuses: frames of this run by status ("filtered", "held", "skipped").
-        counts: repaired pixels by reason, summed over this run's frames.
+        counts: repaired and not finite pixels by reason, summed over this run's frames.
         notes: each distinct note of this run's frames.
         interrupted: stopped before the end; `run(..., resume=True)` continues.
         device: what computed, for example "cpu"; "" if there was nothing left to do.
@@ -266,8 +267,9 @@ def _write(
         notes.append(f"header attributes that could not be passed through: {', '.join(dropped)}")
     if (np.asarray(item.frame.object_id) == -1).all():
         notes.append("a frame without any surface: it passed through unfiltered")
+    broken = int(np.count_nonzero(~np.isfinite(output.image).all(axis=-1)))
     rejected = {name: int(count) for name, count in output.rejected._asdict().items()}
-    counts = Counter(item.counts) + Counter(rejected) + Counter(clipped=clipped)
+    counts = Counter(item.counts) + Counter(rejected) + Counter(clipped=clipped, not_finite=broken)
     return FrameReport(plan.files[index][0], "filtered", path, dict(counts), tuple(notes))
 
 

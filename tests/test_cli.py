@@ -13,6 +13,8 @@ import pytest
 from shots import write_frame, write_shot
 
 from svgf_jax import exr
+from svgf_jax.commands import terminal
+from svgf_jax.types import Rejected
 
 ROOT = Path(__file__).parents[1]
 PRELUDE = """
@@ -154,7 +156,7 @@ def test_denoise_writes_frames_and_tells_what_it_does(denoised, shots):
         f"shot.000{i}.{kind}" for i in (1, 2, 3) for kind in ("exr", "png")
     ]
     for number in (1, 2, 3):
-        assert re.search(rf"^frame {number}: filtered in \d+\.\d\d s -> .*shot\.000{number}\.exr", done.stderr, re.M)
+        assert re.search(rf"^frame {number}: filtered -> .*shot\.000{number}\.exr", done.stderr, re.M)
     assert "albedo    albedo.R albedo.G albedo.B (native name)" in done.stderr
     assert "3 frames (3 filtered) in" in done.stderr
     summary = json.loads(done.stdout)
@@ -195,6 +197,27 @@ def test_a_terminal_gets_a_progress_bar(shots, tmp_path):
     assert process.wait(60) == 0
     assert b"frames/s" in shown
     assert b"3/3" in shown
+
+
+def test_every_count_is_told_in_words():
+    read = {"excess", "guides", "normal"}
+    assert terminal.REPAIRS.keys() == read | set(Rejected._fields) | {"clipped", "not_finite"}
+    assert terminal.repairs({"negative": 1, "radiance": 2}) == [
+        "1 pixel with negative radiance: set to 0",
+        "2 pixels with non-finite radiance: set to 0",
+    ]
+
+
+def test_repairs_are_told_per_frame_and_at_the_end(tmp_path):
+    write_shot(tmp_path / "in", [1, 2])
+    for path in (tmp_path / "in").glob("*.exr"):
+        image = exr.read(path)
+        image.channels["direct.R"][3, 4:6] = np.nan
+        exr.write(path, image)
+    done = command("denoise", "in", "-o", "out", "--set", "levels=1", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"^frame 1: filtered -> .*; 2 pixels with non-finite radiance: set to 0$", done.stderr, re.M)
+    assert "warning: 4 pixels with non-finite radiance: set to 0\n" in done.stderr
 
 
 LONG = ["denoise", "in", "--set", "levels=0", "--checkpoint-every", "5", "-o"]
@@ -371,6 +394,9 @@ def test_params_list_and_show(tmp_path):
     assert done.returncode == 0, done.stderr
     for word in ("paper", "falcor", "sigma_normal", "feedback_level", "128"):
         assert word in done.stdout
+    for line in done.stdout.splitlines():
+        assert len(line) <= 100
+    assert "…" not in done.stdout
     done = command("params", "show", "falcor", "--set", "sigma_luminance=4,3,2,1")
     assert done.returncode == 0, done.stderr
     (tmp_path / "mine.toml").write_text(done.stdout)

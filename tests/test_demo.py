@@ -37,7 +37,7 @@ def test_the_demo_denoises_measures_and_shows(tmp_path, capsys):
     told = capsys.readouterr()
     assert "noisy" in told.out
     assert "denoised" in told.out
-    assert told.err.count("filtered in") == 10
+    assert told.err.count(": filtered -> ") == 10
     assert len(list((tmp_path / "out").glob("frame_*.exr"))) == 10
     picture = np.asarray(Image.open(tmp_path / "out" / "demo.png")).astype(float)
     assert picture.shape[1] > 3 * 448

@@ -267,6 +267,15 @@ def test_repaired_pixels_and_empty_frames_are_told(tmp_path):
     assert any("without any surface" in note for note in summary.notes)
 
 
+def test_output_that_is_not_finite_is_told(shot, tmp_path):
+    def broken(history, frame, *, params, config):
+        history, output = step(history, frame, params=params, config=config)
+        return history, output._replace(image=output.image.at[2, 3:5].set(np.nan).at[1, 1, 0].set(np.inf))
+
+    summary = streaming.run(open_source(shot), tmp_path / "out", pipeline=(init, broken))
+    assert summary.counts["not_finite"] == 3 * 7
+
+
 def test_a_full_disk_is_a_clear_error_and_resumable(shot, tmp_path, monkeypatch):
     run(shot, tmp_path / "whole")
     write = exr.write

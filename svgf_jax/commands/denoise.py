@@ -132,9 +132,7 @@ def _conclude(summary: "Summary", *, verbose: bool) -> None:
     """Tell what was done, and every repair and oddity on the way."""
     done = sum(summary.statuses.values())
     terminal.warn(summary.notes)
-    if summary.counts:
-        repaired = ", ".join(f"{count} {reason}" for reason, count in summary.counts.items())
-        terminal.warn([f"pixels repaired: {repaired}"])
+    terminal.warn(terminal.repairs(summary.counts))
     if verbose and summary.device:
         terminal.tell(f"device: {summary.device}")
     if summary.resumed_at == summary.frames:

@@ -19,16 +19,22 @@ def list_() -> None:
 
     from svgf_jax import parameters
 
+    console = Console()
+    with_meanings = console.width >= 110
     presets = {name: parameters.preset(name) for name in parameters.PRESETS}
     table = Table(box=SIMPLE)
     for name in ("parameter", *presets):
-        table.add_column(name, justify="left" if name == "parameter" else "right", no_wrap=True)
-    table.add_column("meaning")
+        table.add_column(name, justify="left" if name == "parameter" else "right", overflow="fold")
+    if with_meanings:
+        table.add_column("meaning", overflow="fold")
     meanings = _meanings(Params) | _meanings(Config)
     for name in (*Params._fields, *Config._fields):
         values = [getattr(params if name in Params._fields else config, name) for params, config in presets.values()]
-        table.add_row(*map(Text, (name, *map(_short, values), meanings.get(name, ""))))
-    Console().print(table)
+        cells = (name, *map(_short, values), *([meanings.get(name, "")] if with_meanings else []))
+        table.add_row(*map(Text, cells))
+    console.print(table)
+    if not with_meanings:
+        console.print("A terminal of 110 columns or more also shows what each parameter means.")
 
 
 def show(

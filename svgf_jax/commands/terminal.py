@@ -4,13 +4,28 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from svgf_jax.streaming import FrameReport
+
+
+REPAIRS = {
+    "excess": "with more emission than the radiance that contains it: the rest taken as 0",
+    "guides": "hit, but without a usable depth or normal: taken as background",
+    "normal": "with a normal not of unit length: brought to it",
+    "radiance": "with non-finite radiance: set to 0",
+    "negative": "with negative radiance: set to 0",
+    "emission": "with non-finite emission: set to 0",
+    "surface": "with a non-finite normal, depth or albedo: taken as background",
+    "motion": "with non-finite motion or previous depth: without history",
+    "clipped": "brighter than 16-bit float holds: clamped (--float keeps them)",
+    "not_finite": "not finite in the output",
+}
+"""What became of the pixels that a frame's report counts, by its reason."""
 
 
 def tell(text: str) -> None:
@@ -22,6 +37,11 @@ def warn(texts: Iterable[str]) -> None:
     """Each text as a warning on the standard error."""
     for text in texts:
         tell(f"warning: {text}")
+
+
+def repairs(counts: Mapping[str, int]) -> list[str]:
+    """A phrase for each reason for which pixels were counted: `2 pixels with negative radiance: set to 0`."""
+    return [f"{count} pixel{'s' * (count != 1)} {REPAIRS.get(reason, reason)}" for reason, count in counts.items()]
 
 
 def print_json(value: Any) -> None:
@@ -42,16 +62,10 @@ def progress(total: int) -> Iterator[Callable[["FrameReport"], None]]:
 
 
 @contextmanager
-def _lines(total: int) -> Iterator[Callable[["FrameReport"], None]]:
-    last = time.monotonic()
-
+def _lines(_: int) -> Iterator[Callable[["FrameReport"], None]]:
     def on_frame(report: "FrameReport") -> None:
-        nonlocal last
-        now = time.monotonic()
-        repaired = "".join(f", {count} {reason}" for reason, count in report.counts.items())
         where = "" if report.path is None else f" -> {report.path}"
-        tell(f"frame {report.number}: {report.status} in {now - last:.2f} s{where}{repaired}")
-        last = now
+        tell("; ".join([f"frame {report.number}: {report.status}{where}", *repairs(report.counts)]))
 
     yield on_frame
 
