@@ -71,7 +71,7 @@ def find_camera(cameras: Cameras, number: int) -> Camera:
         there = sorted(cameras.frames)
         raise SvgfError(
             f"{cameras.path}: no camera for frame {number}; it has frames {there[0]} to {there[-1]} ({len(there)}). "
-            "Add the frame, or go on without cameras (--cameras none)."
+            "Add the frame."
         )
     return cameras.frames[number]
 

@@ -189,7 +189,10 @@ def _guides(
     depth = planes["depth"][..., 0] if "depth" in planes else np.ones(shape, np.float32)
     surface &= (depth > 0) & (depth < FAR)
     if "id" in planes or "alpha" in planes:
-        counts["guides"] = int((hit & ~surface & ~(depth >= FAR)).sum())
+        unexplained = ~(depth >= FAR)
+        if "id" in planes:  # an id says that something was hit: at an infinite depth the filter cannot follow it
+            unexplained |= np.isposinf(depth)
+        counts["guides"] = int((hit & ~surface & unexplained).sum())
     counts["normal"] = int((surface & (np.abs(length - 1) > 0.01)).sum())
     normal = np.where(surface[..., None], normal / length[..., None], 0).astype(np.float32)
     return np.where(surface, ids, -1).astype(np.int32), normal, np.where(surface, depth, 0).astype(np.float32)
@@ -205,13 +208,14 @@ def _past(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Motion `[H, W, 2]` and prev_depth `[H, W]` with respect to the frame that is read before this one."""
     number = source.sequence.files[index][0]
-    before = [other for other, path in source.sequence.files[:index] if path is not None]
+    earlier = (source.sequence.files[i] for i in range(index - 1, -1, -1))
+    before = next((other for other, path in earlier if path is not None), None)
     motion = planes.get("motion", np.zeros((*depth.shape, 2), np.float32))
     prev_depth = depth
-    skipped = bool(before) and before[-1] != number - 1
-    if before and source.cameras and planes.keys() & {"depth", "position"}:
+    skipped = before is not None and before != number - 1
+    if before is not None and source.cameras and planes.keys() & {"depth", "position"}:
         (left, top, *_), (screen_left, screen_top, *_) = source.data_window, source.display_window
-        where: Any = {"number": number, "previous": before[-1], "position": planes.get("position")}
+        where: Any = {"number": number, "previous": before, "position": planes.get("position")}
         where["origin"] = (left - screen_left, top - screen_top)
         if skipped or "motion" not in planes:
             prev_depth, motion = reproject(source.cameras, depth, object_id, **where)
@@ -219,7 +223,7 @@ def _past(
             prev_depth = previous_depth(source.cameras, depth, object_id, **where)
     elif skipped and "motion" in planes:
         notes.append(
-            f"frame {number} follows frame {before[-1]}, but its motion vectors lead to frame {number - 1}; "
+            f"frame {number} follows frame {before}, but its motion vectors lead to frame {number - 1}; "
             "a cameras.json would tell the whole way."
         )
     sky = (object_id == -1)[..., None]
