@@ -38,7 +38,7 @@ _OFFSETS = square_offsets(2)
 _DARK = 1e-6  # mean luminance below which a ratio means nothing
 _TINY = 1e-12
 
-Color = tuple[Array, Array, Array]
+Color = tuple[Array, ...]  # red, green, blue
 
 
 class Cells(NamedTuple):
@@ -204,8 +204,8 @@ def _judge(cells: Cells, means: tuple[Means, ...], *, size: int, scalars: Params
         with_gain.append(Correction(gain, (zeros,) * 3, luminance_gain, keep, significance))
     narrow, effective = _pool(cells, _compared(means, with_gain), levels=OFFSET_LEVELS, size=size, scalars=scalars)
     return tuple(
-        _with_offset(before, *pooled, effective, scalars.light_offset_threshold)
-        for before, pooled in zip(with_gain, narrow, strict=True)
+        _with_offset(before, current, previous, square, effective, scalars.light_offset_threshold)
+        for before, (current, previous, square) in zip(with_gain, narrow, strict=True)
     )
 
 
