@@ -49,7 +49,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "sigma_luminance": _NOT_NEGATIVE,
     "short_history_boost": (1.0, math.inf),
     "max_history": (1.0, math.inf),
-    "albedo_floor": (1e-9, math.inf),
+    "albedo_floor": (2.0**-30, math.inf),  # a bound that float32 holds exactly
     "depth_epsilon": _NOT_NEGATIVE,
     "luminance_epsilon": _NOT_NEGATIVE,
     "reproject_depth": _NOT_NEGATIVE,
@@ -60,7 +60,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "light_offset_threshold": _NOT_NEGATIVE,
     "light_sigma_normal": _NOT_NEGATIVE,
 }
-_MAX_LEVELS = 12
+_LARGEST_CHOICE = 12
 
 
 def preset(name: str) -> tuple[Params, Config]:
@@ -142,8 +142,8 @@ def override(params: Params, config: Config, values: Mapping[str, Any]) -> tuple
 
 def _choice(name: str, value: Any) -> int:
     least = {"levels": 0, "feedback_level": -1, "light_cell": 0}[name]
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= _MAX_LEVELS:
-        raise SvgfError(f"{name} = {value!r}; wanted a whole number from {least} to {_MAX_LEVELS}")
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= _LARGEST_CHOICE:
+        raise SvgfError(f"{name} = {value!r}; wanted a whole number from {least} to {_LARGEST_CHOICE}")
     return value
 
 

@@ -134,7 +134,7 @@ class Params(NamedTuple):
         sigma_luminance: luminance edge-stopping, in standard deviations, >= 0.
         short_history_boost: factor on the spatial variance estimate at history length 1, >= 1.
         max_history: cap of the history length, in frames, >= 1.
-        albedo_floor: smallest albedo divided by, >= 1e-9.
+        albedo_floor: smallest albedo divided by, >= 2**-30 (about 1e-9).
         depth_epsilon: depth tolerance relative to depth, >= 0.
         luminance_epsilon: luminance tolerance, >= 0.
         reproject_depth: largest relative depth difference of a consistent previous pixel, >= 0.

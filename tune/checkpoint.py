@@ -1,8 +1,6 @@
 """A fit on the disk between two iterations, so that it can be resumed bit for bit: numbers only, nothing that is executed."""
 
 import json
-import os
-import tempfile
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -10,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from svgf_jax import SvgfError
+from svgf_jax.atomic import replacing
 from tune.fitting import Iteration, Progress
 from tune.solver import Descent, arrays, restored
 
@@ -40,12 +39,8 @@ def save(path: Path, progress: Progress, identity: dict[str, Any]) -> None:
     if progress.found is not None:
         content |= {"triangle": progress.found[0], "scatter": progress.found[1], "rows": np.array(progress.found[2])}
     try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-        with os.fdopen(handle, "wb") as file:
+        with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
     except OSError as error:
         raise SvgfError(f"{path}: can't write the checkpoint: {error}") from None
 
