@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from svgf_jax.types import Config, Frame, History, Params, SvgfError
+from svgf_jax.types import Config, Frame, History, Params, SvgfError, choices_of, is_choice
 
 
 def check_frame(frame: Frame) -> None:
@@ -75,8 +75,9 @@ def check_sequence(frames: Frame) -> None:
 
 def check_params(params: Params, config: Config, *, dtype) -> Params:
     """The parameters as arrays of `dtype`; raise `SvgfError` unless each is a scalar or has one value per level."""
-    if config.levels < 0 or config.feedback_level < -1 or config.light_cell < 0:
-        raise SvgfError(f"{config}; wanted levels >= 0, feedback_level >= -1, light_cell >= 0")
+    for name, value in config._asdict().items():
+        if not is_choice(name, value):
+            raise SvgfError(f"{name} is {value!r}; wanted {choices_of(name)}")
     arrays = Params(*(jnp.asarray(leaf, dtype) for leaf in params))
     for name, leaf in arrays._asdict().items():
         if leaf.ndim != 0 and leaf.shape != (max(config.levels, 1),):

@@ -25,7 +25,7 @@ from typing import Any
 import tomli_w
 
 from svgf_jax import atomic
-from svgf_jax.types import Config, Params, SvgfError
+from svgf_jax.types import Config, Params, SvgfError, choices_of, is_choice
 
 PRESETS: dict[str, tuple[Params, Config]] = {
     "paper": (Params(), Config()),
@@ -59,8 +59,9 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "light_gain_threshold": _NOT_NEGATIVE,
     "light_offset_threshold": _NOT_NEGATIVE,
     "light_sigma_normal": _NOT_NEGATIVE,
+    "initial_variance": _NOT_NEGATIVE,
+    "variance_scale": _NOT_NEGATIVE,
 }
-_LARGEST_CHOICE = 12
 
 
 def preset(name: str) -> tuple[Params, Config]:
@@ -140,10 +141,9 @@ def override(params: Params, config: Config, values: Mapping[str, Any]) -> tuple
     return params, config
 
 
-def _choice(name: str, value: Any) -> int:
-    least = {"levels": 0, "feedback_level": -1, "light_cell": 0}[name]
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= _LARGEST_CHOICE:
-        raise SvgfError(f"{name} = {value!r}; wanted a whole number from {least} to {_LARGEST_CHOICE}")
+def _choice(name: str, value: Any) -> Any:
+    if not is_choice(name, value):
+        raise SvgfError(f"{name} = {value!r}; wanted {choices_of(name)}")
     return value
 
 

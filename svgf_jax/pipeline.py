@@ -62,7 +62,7 @@ def step(
     previous = reproject(history, frame, params=params)
     previous = follow_light(previous, illumination, frame, params=params, config=config)
     accumulated = accumulate(illumination, previous, frame, params=params)
-    variance = estimate_variance(accumulated.moments, accumulated.history_length, frame, params=params)
+    variance = estimate_variance(accumulated.moments, accumulated.history_length, frame, params=params, config=config)
     filtered, variance_filtered, feedback = atrous_filter(
         accumulated.illumination, variance, frame, params=params, config=config
     )

@@ -145,6 +145,9 @@ class Params(NamedTuple):
             before the history is scaled to it, > 0. This and the next two are read only where `light_cell` > 0.
         light_offset_threshold: the same over a narrow neighbourhood, before the rest of the difference is added, > 0.
         light_sigma_normal: normal edge-stopping of these neighbourhoods, exponent of the cosine, > 0.
+        initial_variance: the variance of a pixel without history, >= 0. This and the next are read only where `variance` is
+            "temporal".
+        variance_scale: factor on the temporal variance, >= 0.
     """
 
     alpha: Any = 0.2
@@ -164,6 +167,8 @@ class Params(NamedTuple):
     light_gain_threshold: Any = 1.4
     light_offset_threshold: Any = 2.1
     light_sigma_normal: Any = 64.0
+    initial_variance: Any = 100.0
+    variance_scale: Any = 100.0
 
 
 class Config(NamedTuple):
@@ -174,11 +179,35 @@ class Config(NamedTuple):
         feedback_level: the level whose output becomes the history illumination; -1 = the unfiltered accumulation.
             Beyond the last level it is the last.
         light_cell: follow changes of the light, judged over cells of this many pixels squared; 0 = do not.
+        variance: the estimator: "svgf" (temporal, spatial while history is short), "temporal" or "spatial" (always).
     """
 
     levels: int = 5
     feedback_level: int = 0
     light_cell: int = 0
+    variance: str = "svgf"
+
+
+CHOICES: dict[str, range | tuple] = {
+    "levels": range(13),
+    "feedback_level": range(-1, 13),
+    "light_cell": range(13),
+    "variance": ("svgf", "temporal", "spatial"),
+}
+"""What each field of `Config` may be."""
+
+
+def is_choice(name: str, value: Any) -> bool:
+    """Whether a field of `Config` may have this value: True is not 1."""
+    return any(type(value) is type(one) and value == one for one in CHOICES[name])
+
+
+def choices_of(name: str) -> str:
+    """The values that a field of `Config` may have, in words."""
+    values = CHOICES[name]
+    if isinstance(values, range):
+        return f"a whole number from {values[0]} to {values[-1]}"
+    return " or ".join(str(value).lower() for value in values)
 
 
 def at_level(params: Params, level: int) -> Params:

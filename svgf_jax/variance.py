@@ -1,18 +1,29 @@
-"""Luminance variance: from the accumulated moments, or from the neighbourhood while history is short (Schied et al. 2017, 4.2)."""
+"""Luminance variance: from the accumulated moments, or from the neighbourhood while history is short (Schied et al. 2017, 4.2).
+
+`Config.variance` chooses other estimators to compare with: "spatial" looks at the neighbourhood however long the history is;
+"temporal" (as in CUDA-Path-Tracer-Denoising) never does: a constant without history, a multiple of M2 - M1^2 with it.
+"""
 
 import jax.numpy as jnp
 from jax import Array
 
 from svgf_jax.edges import depth_gradient, geometry_exponent, guides_of
 from svgf_jax.sampling import STRIP_ROWS, in_strips, planes, square_offsets, sum_over_taps
-from svgf_jax.types import Frame, Params, at_level
+from svgf_jax.types import Config, Frame, Params, at_level
 
 SHORT_HISTORY = 4 - 1e-3  # history length is a real number: a mean of threes and fives must not be decided by rounding
+_NO_HISTORY = 1 + 1e-3  # a length below this is the frame's own
 _RADIUS = 3
 
 
 def estimate_variance(
-    moments: Array, history_length: Array, frame: Frame, *, params: Params, strip_rows: int | None = STRIP_ROWS
+    moments: Array,
+    history_length: Array,
+    frame: Frame,
+    *,
+    params: Params,
+    config: Config = Config(),
+    strip_rows: int | None = STRIP_ROWS,
 ) -> Array:
     """V = max(0, M2 - M1^2), temporal where history is long enough, else over 7 x 7 pixels.
 
@@ -24,6 +35,8 @@ def estimate_variance(
         history_length: `[H, W]`, h.
         frame: sanitised; its normal, depth and object_id guide the estimate.
         params: per-level leaves are read at entry 0.
+        config: its `variance` says where which of the two is taken: "svgf" as above; "spatial": 7 x 7 everywhere; "temporal":
+            initial_variance without history, else variance_scale * max(0, M2 - M1^2).
         strip_rows: how `sampling.sum_over_taps` blocks the work; None = the plain form.
 
     Returns:
@@ -31,7 +44,10 @@ def estimate_variance(
     """
     scalars = at_level(params, 0)
     guides = guides_of(frame)
-    short = (history_length < SHORT_HISTORY) & (frame.object_id != -1)
+    surface = frame.object_id != -1
+    if config.variance == "temporal":
+        return _temporal_only(moments, history_length, surface, scalars)
+    short = surface & ((history_length < SHORT_HISTORY) | (config.variance == "spatial"))
     slope = depth_gradient(frame.depth, frame.object_id)
     signals = tuple(planes(signal) for signal in moments)
     offsets = square_offsets(_RADIUS)
@@ -85,7 +101,18 @@ def estimate_variance(
         chosen = (jnp.where(short, v * boost, _variance(m1, m2)) for v, (m1, m2) in zip(around, signals, strict=True))
         return tuple(jnp.where(surface, v, 0.0) for v in chosen)
 
-    return jnp.stack(in_strips(choose, spatial, signals, history_length, short, frame.object_id != -1))
+    return jnp.stack(in_strips(choose, spatial, signals, history_length, short, surface))
+
+
+def _temporal_only(moments: Array, history_length: Array, surface: Array, scalars: Params) -> Array:
+    def choose(signals, length, surface):
+        new = length < _NO_HISTORY
+        chosen = (
+            jnp.where(new, scalars.initial_variance, scalars.variance_scale * _variance(m1, m2)) for m1, m2 in signals
+        )
+        return tuple(jnp.where(surface, v, 0.0) for v in chosen)
+
+    return jnp.stack(in_strips(choose, tuple(planes(signal) for signal in moments), history_length, surface))
 
 
 def _variance(first: Array, second: Array) -> Array:

@@ -11,7 +11,7 @@ history: illumination [S, H, W, 3], moments [S, H, W, 2], history_length [H, W],
 output:  image [H, W, 3], illumination [S, H, W, 3], variance [S, H, W], variance_filtered [S, H, W],
          history_length [H, W], valid [H, W] (reprojection found history), rejected (dict of counts)
 params:  the names of `PAPER`; each a number or a list with one number per a-trous level
-config:  levels, feedback_level
+config:  levels, feedback_level, and optionally variance ("svgf", "temporal", "spatial")
 """
 
 from math import exp, floor, isfinite, sqrt
@@ -238,8 +238,11 @@ def normal_weight(n_p, n_q, sigma_normal):
 # Step 5
 
 
-def estimate_variance(moments, length, depth, normal, surface, gradient, params):
-    """Luminance variance [S, H, W]: of the past where it is long enough, else of the 7x7 neighbourhood."""
+def estimate_variance(moments, length, depth, normal, surface, gradient, params, estimator="svgf"):
+    """Luminance variance [S, H, W]: of the past where it is long enough, else of the 7x7 neighbourhood.
+
+    Estimator "spatial": of the neighbourhood however long; "temporal": of the past, a constant where there is none.
+    """
     signals, height, width, _ = moments.shape
     variance = np.zeros((signals, height, width))
     first_moment, second_moment = moments[..., 0].tolist(), moments[..., 1].tolist()
@@ -249,9 +252,14 @@ def estimate_variance(moments, length, depth, normal, surface, gradient, params)
         for x in range(width):
             if not surface[y][x]:
                 continue
-            if length[y, x] >= 4 - 1e-3:
-                for s in range(signals):
-                    variance[s, y, x] = max(0.0, second_moment[s][y][x] - first_moment[s][y][x] ** 2)
+            past = [max(0.0, second_moment[s][y][x] - first_moment[s][y][x] ** 2) for s in range(signals)]
+            if estimator == "temporal":
+                new = length[y, x] < 1 + 1e-3
+                initial, scale = first(params, "initial_variance"), first(params, "variance_scale")
+                variance[:, y, x] = [initial if new else scale * v for v in past]
+                continue
+            if length[y, x] >= 4 - 1e-3 and estimator == "svgf":
+                variance[:, y, x] = past
                 continue
             sum_w, sum_1, sum_2 = 0.0, [0.0] * signals, [0.0] * signals
             for qy in range(max(y - 3, 0), min(y + 4, height)):
@@ -358,7 +366,8 @@ def step(history, frame, params, config):
     taps = reproject_taps(frame, usable_motion, history, params)
     illumination, moments, length, valid = accumulate(illumination, taps, history, surface, params)
     gradient = depth_gradient(depth, frame["object_id"].tolist())
-    variance = estimate_variance(moments, length, depth, normal, surface, gradient, params)
+    estimator = config.get("variance", "svgf")
+    variance = estimate_variance(moments, length, depth, normal, surface, gradient, params, estimator)
 
     filtered, variance_filtered, feedback = illumination, variance, illumination
     for level in range(config["levels"]):

@@ -78,7 +78,10 @@ def frame_of_zeros(signals=1, height=3, width=4):
         (lambda f: svgf_jax.init(jax.tree.map(lambda a: a[None], f)), "call denoise, not step"),
         (lambda f: svgf_jax.step(svgf_jax.init(frame_of_zeros(height=5)), f), "start another with init"),
         (lambda f: svgf_jax.step(svgf_jax.init(frame_of_zeros(signals=2)), f), "start another with init"),
-        (lambda f: svgf_jax.step(svgf_jax.init(f), f, config=svgf_jax.Config(levels=-1)), "wanted levels >= 0"),
+        (
+            lambda f: svgf_jax.step(svgf_jax.init(f), f, config=svgf_jax.Config(levels=-1)),
+            "levels is -1; wanted a whole number from 0 to 12",
+        ),
         (
             lambda f: svgf_jax.step(svgf_jax.init(f), f, params=svgf_jax.Params(alpha=np.ones(3))),
             "each of the 5 levels",

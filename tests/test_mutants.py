@@ -167,6 +167,17 @@ MUTANTS = {
     "window's weights without edges": mutant(
         "variance", "q[\"guides\"].surface * jnp.exp(exponent)", "q[\"guides\"].surface", "test_estimate_variance"
     ),
+    "initial variance after the first frame too": mutant(
+        "variance", "_NO_HISTORY = 1 + 1e-3", "_NO_HISTORY = 2 + 1e-3", "test_estimate_variance_otherwise", "temporal"
+    ),
+    "initial variance scaled": mutant(
+        "variance", "scalars.initial_variance, scalars", "scalars.variance_scale * scalars.initial_variance, scalars",
+        "test_estimate_variance_otherwise", "temporal",
+    ),
+    "spatial only while history is short": mutant(
+        "variance", "((history_length < SHORT_HISTORY) | (config.variance == \"spatial\"))", "(history_length < SHORT_HISTORY)",
+        "test_estimate_variance_otherwise", "spatial",
+    ),
     # A-trous
     "variance divided by the sum of squared weights": Mutant(
         "atrous",

@@ -17,9 +17,11 @@ def test_presets_are_those_of_the_paper_and_of_falcor():
 
 def test_a_file_reads_back_to_the_same_numbers(tmp_path):
     params = sj.Params(alpha=1 / 3, sigma_luminance=np.array([4.0, 3.0, 2.5, 1.0, 0.1]))
-    sj.save_params(tmp_path / "p.toml", params, sj.Config(levels=5, feedback_level=1), provenance={"on": "a sequence"})
+    sj.save_params(
+        tmp_path / "p.toml", params, sj.Config(feedback_level=1, variance="spatial"), provenance={"on": "a sequence"}
+    )
     loaded, config = sj.load_params(tmp_path / "p.toml")
-    assert config == sj.Config(levels=5, feedback_level=1)
+    assert config == sj.Config(feedback_level=1, variance="spatial")
     for got, wanted in zip(loaded, params, strict=True):
         np.testing.assert_array_equal(got, wanted)
     assert [p.name for p in tmp_path.iterdir()] == ["p.toml"]
@@ -42,6 +44,8 @@ def test_a_file_may_build_on_a_preset(tmp_path):
         ("[params]\nsigma_normal = [1.0, 2.0]", "5 levels"),
         ("[config]\nlevels = 2.5", "levels = 2.5"),
         ("[config]\nlevels = 400", "levels = 400"),
+        ("[config]\nlevels = true", "levels = True"),
+        ("[config]\nvariance = 'spacial'", "wanted svgf or temporal or spatial"),
         ("preset = 'paperr'", "Did you mean paper"),
         ("params = 3", "wanted a table"),
         ("pramas = 3", "unknown key 'pramas'"),

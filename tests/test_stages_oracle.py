@@ -188,6 +188,24 @@ def test_estimate_variance():
     assert_close(got, c.variance)
 
 
+@pytest.mark.parametrize("estimator", ["temporal", "spatial"])
+def test_estimate_variance_otherwise(estimator):
+    """The estimators to compare with; the case has pixels without, with short and with long history."""
+    c = case()
+    params = PARAMS | {"initial_variance": 7.0, "variance_scale": 3.0}
+    expected = oracle.estimate_variance(
+        c.moments, c.lengths, c.depth, c.normal, c.surface, c.gradient, params, estimator
+    )
+    got = compiled(
+        variance.estimate_variance,
+        *(c.moments, c.lengths, c.frame),
+        params=to_params(params),
+        config=to_config({"variance": estimator}),
+        strip_rows=4,
+    )
+    assert_close(got, expected)
+
+
 @pytest.mark.parametrize("level", [0, 1])
 def test_atrous_level(level):
     c = case()

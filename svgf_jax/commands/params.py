@@ -70,4 +70,6 @@ def _meanings(cls: type) -> dict[str, str]:
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, str | bool):
+        return str(value).lower()
     return f"{value:g}" if isinstance(value, int | float) else ", ".join(f"{item:g}" for item in value)

@@ -2,8 +2,9 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
-from svgf_jax.types import Config, Params, SvgfError
+from svgf_jax.types import CHOICES, Config, Params, SvgfError, choices_of
 
 
 def choose(preset: str | None, file: Path | None, changes: Iterable[str]) -> tuple[str, Params, Config]:
@@ -38,12 +39,16 @@ def _split(text: str, *, option: str, example: str) -> tuple[str, str]:
     return key, value
 
 
-def _value(key: str, text: str) -> int | float | list[float]:
-    """A number, or a comma list of one per a-trous level; whole numbers for the choices in `Config`."""
-    kind = int if key in Config._fields else float
+def _value(key: str, text: str) -> Any:
+    """A number, or a comma list of one per a-trous level; for a field of `Config` one of its choices."""
+    if key in Config._fields:
+        named = {str(value).lower(): value for value in CHOICES[key]}
+        if text.lower() not in named:
+            raise SvgfError(f"Got --set {key}={text}; wanted {choices_of(key)}.")
+        return named[text.lower()]
     try:
-        values = [kind(item) for item in text.split(",")]
+        values = [float(item) for item in text.split(",")]
     except ValueError as error:
-        wanted = "a whole number" if kind is int else f"a number, or one per a-trous level: {key}=4,3,2,1,1"
+        wanted = f"a number, or one per a-trous level: {key}=4,3,2,1,1"
         raise SvgfError(f"Got --set {key}={text}; wanted {wanted}.") from error
     return values[0] if len(values) == 1 else values
