@@ -24,6 +24,15 @@ if TYPE_CHECKING:
     from svgf_jax.frames import open_source as open_source
     from svgf_jax.frames import read_frame as read_frame
     from svgf_jax.modulation import modulate as modulate
+    from svgf_jax.moments import Sums as Sums
+    from svgf_jax.moments import Welford as Welford
+    from svgf_jax.moments import add_sample as add_sample
+    from svgf_jax.moments import mean_of as mean_of
+    from svgf_jax.moments import merge_samples as merge_samples
+    from svgf_jax.moments import start_sums as start_sums
+    from svgf_jax.moments import start_welford as start_welford
+    from svgf_jax.moments import variance_of as variance_of
+    from svgf_jax.moments import variance_of_mean as variance_of_mean
     from svgf_jax.parameters import load_params as load_params
     from svgf_jax.parameters import preset as preset
     from svgf_jax.parameters import save_params as save_params
@@ -54,6 +63,10 @@ _HOME = {
     "edges": ["Guides", "depth_gradient", "edge_weight", "guides_of"],
     "frames": ["load_sequence", "open_source", "read_frame"],
     "modulation": ["modulate"],
+    "moments": [
+        *("Sums", "Welford", "add_sample", "mean_of", "merge_samples"),
+        *("start_sums", "start_welford", "variance_of", "variance_of_mean"),
+    ],
     "parameters": ["load_params", "preset", "save_params"],
     "pipeline": ["denoise", "init", "step"],
     "references": ["load_reference", "read_radiance"],

@@ -22,23 +22,37 @@ class Accumulated(NamedTuple):
 def accumulate(illumination: Array, previous: Reprojected, frame: Frame, *, params: Params) -> Accumulated:
     """Blend this frame into its history with a = max(alpha, 1/h), h = min(prev_h + 1, max_history); a = 1 without history.
 
+    Where the frame brings a measured variance v of its pixels' means, the second moment is M1^2 + (1 - a) V' + a v with V' the
+    variance in the history, so that M2 - M1^2 is a mean of measured variances; it is right from the first frame on.
+
     Args:
         illumination: `[S, H, W, 3]`, this frame's demodulated radiance.
         previous: the reprojected history.
-        frame: sanitised; only its object_id is read.
+        frame: sanitised; its object_id is read, and its variance and radiance where it has a variance.
         params: per-level leaves are read at entry 0.
     """
     scalars = at_level(params, 0)
+    measured = None if frame.variance is None else tuple(zip(frame.variance, map(planes, frame.radiance), strict=True))
 
-    def blend(colors, previous_colors, previous_moments, previous_length, valid, surface):
+    def blend(colors, previous_colors, previous_moments, previous_length, valid, surface, measured):
         length = jnp.where(valid, jnp.minimum(previous_length + 1.0, scalars.max_history), 1.0)
         weight = _blend_weight(scalars.alpha, length, valid)
         weight_moments = _blend_weight(scalars.alpha_moments, length, valid)
         lumas = [jnp.minimum(luminance_of_planes(*color), largest_luminance(length.dtype)) for color in colors]
         moments = [(luma, luma * luma) for luma in lumas]
+        blended_moments = jax.tree.map(
+            lambda old, new: _blend(old, new, weight_moments), previous_moments, tuple(moments)
+        )
+        if measured is not None:
+            blended_moments = tuple(
+                (m1, _measured_moment(m1, m2, old, luma, variance, radiance, weight_moments))
+                for (m1, m2), old, luma, (variance, radiance) in zip(
+                    blended_moments, previous_moments, lumas, measured, strict=True
+                )
+            )
         blended = (
             jax.tree.map(lambda old, new: _blend(old, new, weight), previous_colors, colors),
-            jax.tree.map(lambda old, new: _blend(old, new, weight_moments), previous_moments, tuple(moments)),
+            blended_moments,
             length,
         )
         return jax.tree.map(lambda a: jnp.where(surface, a, 0.0), blended)
@@ -51,8 +65,25 @@ def accumulate(illumination: Array, previous: Reprojected, frame: Frame, *, para
         previous.history_length,
         previous.valid,
         frame.object_id != -1,
+        measured,
     )
     return Accumulated(illumination=stack_planes(colors), moments=stack_planes(moments), history_length=length)
+
+
+def _measured_moment(
+    first: Array, second: Array, previous: tuple[Array, Array], luma: Array, variance: Array, radiance, weight: Array
+) -> Array:
+    """The second moment that makes M2 - M1^2 the mean of the measured variances; the plain one where it was not measured.
+
+    The variance is the radiance's; its deviation is demodulated as the pixel's luminance was, which is exact where samples differ
+    in brightness, not in hue.
+    """
+    light = luminance_of_planes(*radiance)
+    lit = light > 0.0
+    ratio = jnp.minimum(jnp.where(lit, luma / jnp.where(lit, light, 1.0), 1.0), 2.0**30)
+    past = jnp.maximum(previous[1] - previous[0] * previous[0], 0.0)
+    measured = first * first + _blend(past, variance * ratio * ratio, weight)
+    return jnp.where(variance >= 0.0, measured, second)
 
 
 def _blend_weight(alpha: Array | float, length: Array, valid: Array) -> Array:

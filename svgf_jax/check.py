@@ -33,7 +33,11 @@ def check_frame(frame: Frame) -> None:
     dtype = frame.radiance.dtype
     if dtype not in (jnp.float32, jnp.float64):
         raise SvgfError(f"radiance is {dtype}; wanted float32 or float64. Try radiance.astype('float32')")
-    for name in Frame._fields:
+    if frame.variance is not None and tuple(frame.variance.shape) != (signals, height, width):
+        raise SvgfError(
+            f"variance has shape {tuple(frame.variance.shape)}; wanted {(signals, height, width)}, one plane a signal"
+        )
+    for name in Frame._fields if frame.variance is not None else Frame._fields[:-1]:
         wanted_dtype = jnp.int32 if name == "object_id" else dtype
         if getattr(frame, name).dtype != wanted_dtype:
             raise SvgfError(
@@ -68,7 +72,9 @@ def check_sequence(frames: Frame) -> None:
             f"radiance has shape {tuple(frames.radiance.shape)}; wanted [T, S, H, W, 3], T frames of S signals. "
             "For one frame call step, or add the leading T: jax.tree.map(lambda a: a[None], frame)"
         )
-    lengths = {name: array.shape[0] if array.shape else 0 for name, array in frames._asdict().items()}
+    lengths = {
+        name: array.shape[0] if array.shape else 0 for name, array in frames._asdict().items() if array is not None
+    }
     if len(set(lengths.values())) != 1 or 0 in lengths.values():
         raise SvgfError(f"the frames' arrays have lengths {lengths}; wanted one length T >= 1 for all")
 

@@ -141,7 +141,9 @@ def read_frame(source: Source, index: int) -> LoadedFrame:
                 "Let the renderer write ids as 32-bit."
             )
     albedo = planes["albedo"] if "albedo" in planes else np.ones_like(emission)
-    arrays: list[Any] = [radiance, albedo[None], emission, normal, depth, prev_depth, motion, object_id]
+    measured = [planes[f"{role}_variance"][..., 0] for role in source.roles.signals if f"{role}_variance" in planes]
+    variance = np.stack(measured) if measured else None
+    arrays: list[Any] = [radiance, albedo[None], emission, normal, depth, prev_depth, motion, object_id, variance]
     counts = {reason: count for reason, count in counts.items() if count}
     return LoadedFrame(Frame(*arrays), number, path, images[path], counts, tuple(notes))
 
@@ -151,7 +153,7 @@ def load_sequence(pattern: PathName, **options: Any) -> Frame:
     source = open_source(pattern, **options)
     with ThreadPoolExecutor(4) as pool:
         frames = list(pool.map(lambda index: read_frame(source, index).frame, range(len(source.sequence.files))))
-    stacked: list[Any] = [np.stack(planes) for planes in zip(*frames, strict=True)]
+    stacked: list[Any] = [None if planes[0] is None else np.stack(planes) for planes in zip(*frames, strict=True)]
     return Frame(*stacked)
 
 

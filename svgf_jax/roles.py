@@ -15,6 +15,10 @@ Native names, as they are looked for in each frame's file:
 | `id`       | `id.I`                       | one object: only depth and normals tell surfaces apart    |
 | `position` | `position.X ...`             | from depth and camera where needed                        |
 | `alpha`    | `A`, if radiance is `R G B`  | every pixel may have a surface                            |
+| `direct_variance`, `indirect_variance`, `radiance_variance` | `direct.variance` ... | estimated by the filter    |
+
+A variance is that of the mean of a pixel's samples (the samples' own divided by their number), of its luminance. It is used
+where every signal has one.
 
 Any role can be given by hand: other channels (`channel`), another file (`file`), or both.
 """
@@ -37,6 +41,9 @@ WIDTH = {
     "id": 1,
     "position": 3,
     "alpha": 1,
+    "direct_variance": 1,
+    "indirect_variance": 1,
+    "radiance_variance": 1,
 }
 """Number of channels of each role."""
 
@@ -50,6 +57,7 @@ _NATIVE = {
     "motion": ("motion.X motion.Y",),
     "id": ("id.I",),
     "alpha": ("A",),
+    **{f"{signal}_variance": (f"{signal}.variance",) for signal in ("direct", "indirect", "radiance")},
 }
 _IN_OWN_FILE = {3: ("R G B", "X Y Z"), 2: ("X Y", "R G"), 1: ("Z", "I", "Y", "V", "R", "A")}
 _SIGNALS = ("direct", "indirect", "radiance")
@@ -130,6 +138,10 @@ def resolve_roles(
         )
     if "radiance" not in layers and "alpha" not in by_hand:
         layers.pop("alpha", None)
+    measured = [f"{role}_variance" for role in signals]
+    for role in [role for role in layers if role.endswith("_variance")]:
+        if role not in measured or not layers.keys() >= set(measured):
+            layers.pop(role)
     return Roles(layers, {role: text for role, text in _ABSENT.items() if role not in layers}, signals)
 
 

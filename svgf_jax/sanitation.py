@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
+from svgf_jax.color import largest_luminance
 from svgf_jax.types import Frame, Rejected
 
 _NOWHERE = 1e9  # a motion that points outside every image: no history
@@ -13,7 +14,7 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
 
     Radiance: non-finite or negative components become 0. Emission: non-finite ones become 0, negative ones stay. A non-finite
     normal, depth or albedo: no surface. A non-finite motion or prev_depth: no history. Guides read 0 where there is no surface,
-    the albedo 1.
+    the albedo 1. A measured variance that is not finite or negative becomes -1, unknown.
 
     Args:
         frame: one frame; shapes as in `Frame`.
@@ -41,6 +42,7 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
         prev_depth=jnp.where(surface & traced, frame.prev_depth, 0.0),
         motion=jnp.where((surface & traced)[..., None], frame.motion, _NOWHERE),
         object_id=jnp.where(surface, frame.object_id, -1),
+        variance=None if frame.variance is None else _known_variance(frame.variance),
     )
     rejected = Rejected(
         radiance=_count(~radiance_finite.all(axis=(0, 3))),
@@ -50,6 +52,12 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
         motion=_count(surface & ~traced),
     )
     return repaired, rejected
+
+
+def _known_variance(variance: Array) -> Array:
+    """Kept so small that its division by the square of the least albedo floor, 2**-30, stays finite."""
+    known = jnp.isfinite(variance) & (variance >= 0.0)
+    return jnp.where(known, jnp.minimum(variance, largest_luminance(variance.dtype) ** 2 / 2.0**60), -1.0)
 
 
 def _count(pixels: Array) -> Array:

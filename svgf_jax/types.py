@@ -19,6 +19,7 @@ Conventions, stated here once:
 | `prev_depth`  | `[H, W]`               | the depth that this surface point had in the previous frame's camera, else `depth`|
 | `motion`      | `[H, W, 2]`            | pixels: previous position = this position + motion (x right, y down)              |
 | `object_id`   | `[H, W]` int32         | any number per object; -1 = no surface (background)                               |
+| `variance`    | `[S, H, W]` or None    | measured variance of the pixel's mean, of the radiance's luminance; < 0 = unknown |
 """
 
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -44,6 +45,7 @@ class Frame(NamedTuple):
     prev_depth: Array
     motion: Array
     object_id: Array
+    variance: Array | None = None
 
 
 class History(NamedTuple):

@@ -30,6 +30,9 @@ def estimate_variance(
     The spatial estimate is the mean of the moments over the window with the weights w_z w_n, and is multiplied by
     max(1, short_history_boost / h). Strips of the image in which no pixel needs it are skipped.
 
+    Where the frame brings measured variances, M2 - M1^2 is their mean over time from the first frame on: the spatial estimate is
+    then the weighted mean of the neighbours' M2 - M1^2, without a boost, and "temporal" needs no initial value.
+
     Args:
         moments: `[S, H, W, 2]`, accumulated M1 and M2 of the luminance.
         history_length: `[H, W]`, h.
@@ -43,13 +46,16 @@ def estimate_variance(
         `[S, H, W]`, >= 0; 0 where there is no surface.
     """
     scalars = at_level(params, 0)
-    guides = guides_of(frame)
-    surface = frame.object_id != -1
+    guides, surface = guides_of(frame), frame.object_id != -1
+    measured = None if frame.variance is None else (frame.variance >= 0.0).all(axis=0)
     if config.variance == "temporal":
-        return _temporal_only(moments, history_length, surface, scalars)
+        return _temporal_only(moments, history_length, surface, measured, scalars)
     short = surface & ((history_length < SHORT_HISTORY) | (config.variance == "spatial"))
     slope = depth_gradient(frame.depth, frame.object_id)
-    signals = tuple(planes(signal) for signal in moments)
+    signals = own = tuple(planes(signal) for signal in moments)
+    if measured is not None:  # the neighbours' variances themselves are averaged: the spread of their means is no noise
+        guides = guides._replace(surface=guides.surface * measured.astype(frame.depth.dtype))
+        signals = tuple((jnp.zeros_like(m1), _variance(m1, m2)) for m1, m2 in own)
     offsets = square_offsets(_RADIUS)
     steps = offsets.astype(frame.depth.dtype)
 
@@ -97,22 +103,26 @@ def estimate_variance(
     )
 
     def choose(around, signals, length, short, surface):
-        boost = jnp.maximum(1.0, scalars.short_history_boost / jnp.maximum(length, 1.0))
+        boost = jnp.maximum(1.0, scalars.short_history_boost / jnp.maximum(length, 1.0)) if measured is None else 1.0
         chosen = (jnp.where(short, v * boost, _variance(m1, m2)) for v, (m1, m2) in zip(around, signals, strict=True))
         return tuple(jnp.where(surface, v, 0.0) for v in chosen)
 
-    return jnp.stack(in_strips(choose, spatial, signals, history_length, short, surface))
+    return jnp.stack(in_strips(choose, spatial, own, history_length, short, surface))
 
 
-def _temporal_only(moments: Array, history_length: Array, surface: Array, scalars: Params) -> Array:
-    def choose(signals, length, surface):
+def _temporal_only(
+    moments: Array, history_length: Array, surface: Array, measured: Array | None, scalars: Params
+) -> Array:
+    def choose(signals, length, surface, measured):
         new = length < _NO_HISTORY
+        new = new if measured is None else new & ~measured
         chosen = (
             jnp.where(new, scalars.initial_variance, scalars.variance_scale * _variance(m1, m2)) for m1, m2 in signals
         )
         return tuple(jnp.where(surface, v, 0.0) for v in chosen)
 
-    return jnp.stack(in_strips(choose, tuple(planes(signal) for signal in moments), history_length, surface))
+    signals = tuple(planes(signal) for signal in moments)
+    return jnp.stack(in_strips(choose, signals, history_length, surface, measured))
 
 
 def _variance(first: Array, second: Array) -> Array:

@@ -31,6 +31,8 @@ def test_the_public_names_are_these():
         ),
         *("atrous_level", "atrous_filter", "luminance", "tonemap"),
         *("preset", "load_params", "save_params"),
+        *("Sums", "Welford", "start_sums", "start_welford", "add_sample", "merge_samples"),
+        *("mean_of", "variance_of", "variance_of_mean"),
         *("open_source", "read_frame", "load_sequence", "load_reference", "read_radiance", "sample"),
     }
 
@@ -65,7 +67,7 @@ def test_importing_the_package_does_not_import_jax():
 def frame_of_zeros(signals=1, height=3, width=4):
     shapes = dict.fromkeys(svgf_jax.Frame._fields, (height, width))
     shapes |= {"radiance": (signals, height, width, 3), "albedo": (1, height, width, 3), "motion": (height, width, 2)}
-    shapes |= {"emission": (height, width, 3), "normal": (height, width, 3)}
+    shapes |= {"emission": (height, width, 3), "normal": (height, width, 3), "variance": (signals, height, width)}
     types = {name: np.int32 if name == "object_id" else np.float32 for name in shapes}
     return svgf_jax.Frame(**{name: np.zeros(shape, types[name]) for name, shape in shapes.items()})
 
@@ -87,6 +89,7 @@ def frame_of_zeros(signals=1, height=3, width=4):
             "each of the 5 levels",
         ),
         (lambda f: svgf_jax.step(svgf_jax.init(f), f._replace(depth=f.depth[:2])), r"depth has shape \(2, 4\)"),
+        (lambda f: svgf_jax.init(f._replace(variance=f.depth)), r"variance has shape \(3, 4\); wanted \(1, 3, 4\)"),
         (
             lambda f: svgf_jax.step(svgf_jax.init(f), f._replace(depth=f.motion[..., 0].astype(np.int32))),
             "depth is int32",

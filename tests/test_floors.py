@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"atomic"},
     {"types"},
-    {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check"},
+    {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments"},
     {"edges", "exr", "sanitation", "accumulation", "reprojection", "modulation", "sequences", "cameras"},
     {"variance", "atrous", "adaptation", "roles", "preview"},
     {"frames", "references", "pipeline", "checkpoint"},

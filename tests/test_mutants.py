@@ -149,7 +149,7 @@ MUTANTS = {
     ),
     # Variance
     "no boost of the short history": mutant(
-        "variance", "v * boost", "v", "test_estimate_variance"
+        "variance", "jnp.where(short, v * boost,", "jnp.where(short, v,", "test_estimate_variance"
     ),
     "boost below one": mutant(
         "variance", "jnp.maximum(1.0, scalars.short_history_boost /", "(scalars.short_history_boost /",

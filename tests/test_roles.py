@@ -14,10 +14,23 @@ NATIVE = [*rgb("direct", "indirect", "emission", "albedo"), "depth.Z", "motion.X
 NATIVE += [f"{name}.{c}" for name in ("normal", "position") for c in "XYZ"]
 
 
+MEASURED = {"direct_variance", "indirect_variance", "radiance_variance"}
+
+
+def test_measured_variances_are_taken_where_every_signal_has_one():
+    both = [*NATIVE, "direct.variance", "indirect.variance", "radiance.variance"]
+    layers = resolve_roles(both).layers
+    assert layers["direct_variance"].channels == ("direct.variance",)
+    assert MEASURED & layers.keys() == {"direct_variance", "indirect_variance"}
+    assert not MEASURED & resolve_roles([*NATIVE, "direct.variance"]).layers.keys()
+    beauty = resolve_roles(["R", "G", "B", "V"], channel={"radiance_variance": ["V"]})
+    assert beauty.layers["radiance_variance"].channels == ("V",)
+
+
 def test_the_native_schema():
     roles = resolve_roles(NATIVE)
     assert roles.signals == ("direct", "indirect")
-    assert set(roles.layers) == set(WIDTH) - {"radiance", "alpha"}
+    assert set(roles.layers) == set(WIDTH) - {"radiance", "alpha"} - MEASURED
     assert roles.layers["normal"].channels == ("normal.X", "normal.Y", "normal.Z")
     assert roles.absent == {}
     assert all(layer.reason == "native name" and not layer.own_file for layer in roles.layers.values())

@@ -107,7 +107,7 @@ def test_sanitise():
         for name in ("motion", "prev_depth"):
             np.testing.assert_array_equal(getattr(frame, name)[surface & usable], clean[name][surface & usable])
         assert (np.abs(frame.motion[~usable]).max(axis=-1) > 1e6).all(), "no history"
-        assert all(np.isfinite(leaf).all() for leaf in frame)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(frame))
 
 
 def test_demodulate():

@@ -42,7 +42,7 @@ def shot_of_arrays(frames: Frame, targets: Any, *, name: str = "frames") -> Shot
         )
 
     def read(index: int) -> Example:
-        leaves: list[Any] = [np.asarray(leaf[index]) for leaf in frames]
+        leaves: list[Any] = [None if leaf is None else np.asarray(leaf[index]) for leaf in frames]
         return Example(Frame(*leaves), targets[index])
 
     return Shot(name, targets.shape[0], read)
@@ -108,10 +108,11 @@ def window(shot: Shot, *, rows: slice = slice(None), columns: slice = slice(None
 
     def read(index: int) -> Example:
         frame, target = shot.read(indices[index])
-        axes = {"depth": 0, "prev_depth": 0, "object_id": 0, "radiance": 1, "albedo": 1}
+        axes = {"depth": 0, "prev_depth": 0, "object_id": 0, "radiance": 1, "albedo": 1, "variance": 1}
         cut: dict[str, Any] = {
             name: np.ascontiguousarray(leaf[(slice(None),) * (axes.get(name) == 1) + (rows, columns)])
             for name, leaf in frame._asdict().items()
+            if leaf is not None
         }
         return Example(Frame(**cut), None if target is None else np.ascontiguousarray(target[rows, columns]))
 
