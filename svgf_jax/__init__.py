@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from svgf_jax.frames import load_sequence as load_sequence
     from svgf_jax.frames import open_source as open_source
     from svgf_jax.frames import read_frame as read_frame
+    from svgf_jax.joint_bilateral import bilateral_filter as bilateral_filter
+    from svgf_jax.joint_bilateral import gaussian_filter as gaussian_filter
+    from svgf_jax.joint_bilateral import joint_bilateral_filter as joint_bilateral_filter
     from svgf_jax.modulation import modulate as modulate
     from svgf_jax.moments import Sums as Sums
     from svgf_jax.moments import Welford as Welford
@@ -62,6 +65,7 @@ _HOME = {
     "demo": ["sample"],
     "edges": ["Guides", "depth_gradient", "edge_weight", "guides_of"],
     "frames": ["load_sequence", "open_source", "read_frame"],
+    "joint_bilateral": ["bilateral_filter", "gaussian_filter", "joint_bilateral_filter"],
     "modulation": ["modulate"],
     "moments": [
         *("Sums", "Welford", "add_sample", "mean_of", "merge_samples"),
