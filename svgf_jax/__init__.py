@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from svgf_jax.accumulation import Accumulated as Accumulated
     from svgf_jax.accumulation import accumulate as accumulate
+    from svgf_jax.accumulation import clamp_history as clamp_history
     from svgf_jax.atrous import atrous_filter as atrous_filter
     from svgf_jax.atrous import atrous_level as atrous_level
     from svgf_jax.color import demodulate as demodulate
@@ -59,7 +60,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "accumulation": ["Accumulated", "accumulate"],
+    "accumulation": ["Accumulated", "accumulate", "clamp_history"],
     "atrous": ["atrous_filter", "atrous_level"],
     "color": ["demodulate", "luminance", "remodulate", "tonemap"],
     "demo": ["sample"],

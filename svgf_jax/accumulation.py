@@ -1,4 +1,8 @@
-"""Temporal accumulation: exponential moving averages of illumination and luminance moments (Schied et al. 2017, section 4.1)."""
+"""Temporal accumulation: exponential moving averages of illumination and luminance moments (Schied et al. 2017, section 4.1).
+
+Before it, by choice, the clamp of temporal anti-aliasing (Karis 2014) and of GAMES202's homework 5: history that is nothing like
+its surroundings now is drawn towards them.
+"""
 
 from typing import NamedTuple
 
@@ -7,8 +11,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from svgf_jax.color import largest_luminance, luminance_of_planes
-from svgf_jax.sampling import in_strips, planes, stack_planes
-from svgf_jax.types import Frame, Params, Reprojected, at_level
+from svgf_jax.sampling import STRIP_ROWS, in_strips, planes, stack_planes
+from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
+from svgf_jax.windows import window_range
 
 
 class Accumulated(NamedTuple):
@@ -19,7 +24,9 @@ class Accumulated(NamedTuple):
     history_length: Array
 
 
-def accumulate(illumination: Array, previous: Reprojected, frame: Frame, *, params: Params) -> Accumulated:
+def accumulate(
+    illumination: Array, previous: Reprojected, frame: Frame, *, params: Params, config: Config = Config()
+) -> Accumulated:
     """Blend this frame into its history with a = max(alpha, 1/h), h = min(prev_h + 1, max_history); a = 1 without history.
 
     Where the frame brings a measured variance v of its pixels' means, the second moment is M1^2 + (1 - a) V' + a v with V' the
@@ -30,14 +37,16 @@ def accumulate(illumination: Array, previous: Reprojected, frame: Frame, *, para
         previous: the reprojected history.
         frame: sanitised; its object_id is read, and its variance and radiance where it has a variance.
         params: per-level leaves are read at entry 0.
+        config: without `warm_up`, a = alpha wherever there is history.
     """
     scalars = at_level(params, 0)
     measured = None if frame.variance is None else tuple(zip(frame.variance, map(planes, frame.radiance), strict=True))
 
     def blend(colors, previous_colors, previous_moments, previous_length, valid, surface, measured):
         length = jnp.where(valid, jnp.minimum(previous_length + 1.0, scalars.max_history), 1.0)
-        weight = _blend_weight(scalars.alpha, length, valid)
-        weight_moments = _blend_weight(scalars.alpha_moments, length, valid)
+        least = 1.0 / jnp.maximum(length, 1.0) if config.warm_up else jnp.zeros_like(length)
+        weight = _blend_weight(scalars.alpha, least, valid)
+        weight_moments = _blend_weight(scalars.alpha_moments, least, valid)
         lumas = [jnp.minimum(luminance_of_planes(*color), largest_luminance(length.dtype)) for color in colors]
         moments = [(luma, luma * luma) for luma in lumas]
         blended_moments = jax.tree.map(
@@ -70,6 +79,42 @@ def accumulate(illumination: Array, previous: Reprojected, frame: Frame, *, para
     return Accumulated(illumination=stack_planes(colors), moments=stack_planes(moments), history_length=length)
 
 
+def clamp_history(
+    previous: Reprojected,
+    illumination: Array,
+    frame: Frame,
+    *,
+    params: Params,
+    config: Config,
+    strip_rows: int | None = STRIP_ROWS,
+) -> Reprojected:
+    """Clamp the history, channel by channel, to mean +- clamp_sigma standard deviations of this frame around each pixel.
+
+    The window has (2 clamp_radius + 1)^2 pixels, of which those with a surface count. The moments are left as they are: they tell
+    how much the light varies over time.
+
+    Args:
+        previous: the reprojected history.
+        illumination: `[S, H, W, 3]`, this frame's.
+        frame: sanitised; only its object_id is read.
+        params: per-level leaves are read at entry 0.
+        config: `clamp_radius` 0 returns `previous` as it is.
+        strip_rows: how `sampling.sum_over_taps` blocks the work; None = the plain form.
+    """
+    if not config.clamp_radius:
+        return previous
+    sigma = at_level(params, 0).clamp_sigma
+    colors = tuple(map(planes, illumination))
+    least, most = window_range(
+        colors, frame.object_id != -1, radius=config.clamp_radius, sigma=sigma, strip_rows=strip_rows
+    )
+    clamp = lambda old, low, high: jnp.minimum(jnp.maximum(old, low), high)  # noqa: E731
+    clamped = jax.tree.map(clamp, tuple(map(planes, previous.illumination)), least, most)
+    # Where there is no history the 0 stays: nothing reads it, and nothing should.
+    held = jax.tree.map(lambda a: jnp.where(previous.valid, a, 0.0), clamped)
+    return previous._replace(illumination=stack_planes(held))
+
+
 def _measured_moment(
     first: Array, second: Array, previous: tuple[Array, Array], luma: Array, variance: Array, radiance, weight: Array
 ) -> Array:
@@ -86,8 +131,8 @@ def _measured_moment(
     return jnp.where(variance >= 0.0, measured, second)
 
 
-def _blend_weight(alpha: Array | float, length: Array, valid: Array) -> Array:
-    return jnp.where(valid, jnp.maximum(alpha, 1.0 / jnp.maximum(length, 1.0)), 1.0)
+def _blend_weight(alpha: Array | float, least: Array, valid: Array) -> Array:
+    return jnp.where(valid, jnp.maximum(alpha, least), 1.0)
 
 
 def _blend(previous: Array, current: Array, weight: Array) -> Array:

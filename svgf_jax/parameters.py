@@ -61,6 +61,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "light_sigma_normal": _NOT_NEGATIVE,
     "initial_variance": _NOT_NEGATIVE,
     "variance_scale": _NOT_NEGATIVE,
+    "clamp_sigma": _NOT_NEGATIVE,
 }
 
 

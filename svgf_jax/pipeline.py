@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from svgf_jax.accumulation import accumulate
+from svgf_jax.accumulation import accumulate, clamp_history
 from svgf_jax.adaptation import follow_light
 from svgf_jax.atrous import atrous_filter
 from svgf_jax.check import check_frame, check_history, check_params, check_sequence
@@ -59,9 +59,10 @@ def step(
 
     frame, rejected = sanitise(frame)
     illumination = demodulate(frame.radiance, frame.albedo, albedo_floor=floor)
-    previous = reproject(history, frame, params=params)
+    previous = reproject(history, frame, params=params, config=config)
     previous = follow_light(previous, illumination, frame, params=params, config=config)
-    accumulated = accumulate(illumination, previous, frame, params=params)
+    previous = clamp_history(previous, illumination, frame, params=params, config=config)
+    accumulated = accumulate(illumination, previous, frame, params=params, config=config)
     variance = estimate_variance(accumulated.moments, accumulated.history_length, frame, params=params, config=config)
     filtered, variance_filtered, feedback = atrous_filter(
         accumulated.illumination, variance, frame, params=params, config=config

@@ -6,13 +6,21 @@ import numpy as np
 from jax import Array, lax
 
 from svgf_jax.sampling import STRIP_ROWS, planes, read_at, square_offsets, stack_planes, strip_count
-from svgf_jax.types import Frame, History, Params, Reprojected, at_level
+from svgf_jax.types import Config, Frame, History, Params, Reprojected, at_level
 
 _LEAST_WEIGHT = 0.01  # of the consistent ones of the 2 x 2 taps, to be trusted
 _BILINEAR = np.array([[0, 0], [0, 1], [1, 0], [1, 1]], dtype=np.int32)
+_NEAREST = np.array([[0, 0]], dtype=np.int32)
 
 
-def reproject(history: History, frame: Frame, *, params: Params, strip_rows: int | None = STRIP_ROWS) -> Reprojected:
+def reproject(
+    history: History,
+    frame: Frame,
+    *,
+    params: Params,
+    config: Config = Config(),
+    strip_rows: int | None = STRIP_ROWS,
+) -> Reprojected:
     """Bring the history to this frame's pixels.
 
     A previous pixel q is consistent with p if it is inside the image, has the same object id, a depth within reproject_depth of
@@ -24,6 +32,8 @@ def reproject(history: History, frame: Frame, *, params: Params, strip_rows: int
         history: of the previous frame.
         frame: sanitised.
         params: per-level leaves are read at entry 0.
+        config: `reprojection` "nearest" takes the pixel nearest to P in place of the 2 x 2; without `fallback` the 3 x 3 are
+            not asked; without `id_test` any surface may continue any other.
         strip_rows: rows handled at a time (the fallback runs only in strips that need it); None = all at once.
     """
     scalars = at_level(params, 0)
@@ -46,7 +56,8 @@ def reproject(history: History, frame: Frame, *, params: Params, strip_rows: int
         q_id, inside = read_at(guides["id"], row, column)
         near = jnp.abs(read(guides["depth"]) - p["depth"]) <= scalars.reproject_depth * jnp.maximum(p["depth"], 1e-6)
         n = [a * read(b) for a, b in zip(p["normal"], guides["normal"], strict=True)]
-        return inside & (p["id"] != -1) & (q_id == p["id"]) & near & (n[0] + n[1] + n[2] >= scalars.reproject_normal)
+        same = q_id == p["id"] if config.id_test else q_id != -1
+        return inside & (p["id"] != -1) & same & near & (n[0] + n[1] + n[2] >= scalars.reproject_normal)
 
     def mean_over(base_row: Array, base_column: Array, offsets: np.ndarray, weigh) -> tuple[Array, tuple]:
         """Weights and weighted sums of the history's values over the taps base + offsets."""
@@ -67,6 +78,12 @@ def reproject(history: History, frame: Frame, *, params: Params, strip_rows: int
         p = jax.tree.map(lambda a: lax.dynamic_slice(a, (first_row, jnp.zeros_like(first_row)), (rows, width)), padded)
         x, y = (_position(p["motion"][axis], first_row, axis, (width, height)[axis]) for axis in (0, 1))
 
+        def nearest():
+            return jnp.floor(y + 0.5).astype(jnp.int32), jnp.floor(x + 0.5).astype(jnp.int32)
+
+        def plain(row: Array, column: Array, offset: Array) -> Array:
+            return consistent(p, row, column).astype(x.dtype)
+
         floor_x, floor_y = jnp.floor(x), jnp.floor(y)
         fraction_x, fraction_y = x - floor_x, y - floor_y
 
@@ -75,23 +92,20 @@ def reproject(history: History, frame: Frame, *, params: Params, strip_rows: int
             weight_x = jnp.where(offset[1] == 1, fraction_x, 1.0 - fraction_x)
             return jnp.where(consistent(p, row, column), weight_y * weight_x, 0.0)
 
-        weight, sums = mean_over(floor_y.astype(jnp.int32), floor_x.astype(jnp.int32), _BILINEAR, bilinear)
+        if config.reprojection == "nearest":
+            weight, sums = mean_over(*nearest(), _NEAREST, plain)
+        else:
+            weight, sums = mean_over(floor_y.astype(jnp.int32), floor_x.astype(jnp.int32), _BILINEAR, bilinear)
         found = weight >= _LEAST_WEIGHT
         missing = ~found & (p["id"] != -1)
 
         def fall_back():
-            nearest = (jnp.floor(y + 0.5).astype(jnp.int32), jnp.floor(x + 0.5).astype(jnp.int32))
-
-            def plain(row: Array, column: Array, offset: Array) -> Array:
-                return consistent(p, row, column).astype(x.dtype)
-
-            weight, sums = mean_over(*nearest, square_offsets(1), plain)
-            return weight, sums
+            return mean_over(*nearest(), square_offsets(1), plain)
 
         def nothing():
             return jax.tree.map(jnp.zeros_like, (weight, sums))
 
-        around, around_sums = lax.cond(jnp.any(missing), fall_back, nothing)
+        around, around_sums = lax.cond(jnp.any(missing), fall_back, nothing) if config.fallback else nothing()
         found_around = missing & (around > 0.0)
         divisor = jnp.where(found, weight, jnp.where(found_around, around, 1.0))
         means = jax.tree.map(

@@ -150,6 +150,8 @@ class Params(NamedTuple):
         initial_variance: the variance of a pixel without history, >= 0. This and the next are read only where `variance` is
             "temporal".
         variance_scale: factor on the temporal variance, >= 0.
+        clamp_sigma: standard deviations that the history may lie off this frame's mean, >= 0. Read only where
+            `clamp_radius` > 0.
     """
 
     alpha: Any = 0.2
@@ -171,6 +173,7 @@ class Params(NamedTuple):
     light_sigma_normal: Any = 64.0
     initial_variance: Any = 100.0
     variance_scale: Any = 100.0
+    clamp_sigma: Any = 1.0
 
 
 class Config(NamedTuple):
@@ -182,12 +185,25 @@ class Config(NamedTuple):
             Beyond the last level it is the last.
         light_cell: follow changes of the light, judged over cells of this many pixels squared; 0 = do not.
         variance: the estimator: "svgf" (temporal, spatial while history is short), "temporal" or "spatial" (always).
+        reprojection: `bilinear` takes the consistent ones of the 2 x 2 previous pixels around a point, `nearest` the one
+            pixel that it falls into.
+        fallback: where those give nothing, take the mean of the consistent ones of 3 x 3.
+        id_test: a previous pixel is consistent only if it shows the same object.
+        warm_up: weigh the first frames of a history equally (1 / history length) until alpha is reached; off, alpha
+            holds from the second frame on.
+        clamp_radius: clamp the history to mean +- clamp_sigma standard deviations of this frame's illumination over
+            a window of this radius (3 = 7 x 7); 0 = do not.
     """
 
     levels: int = 5
     feedback_level: int = 0
     light_cell: int = 0
     variance: str = "svgf"
+    reprojection: str = "bilinear"
+    fallback: bool = True
+    id_test: bool = True
+    warm_up: bool = True
+    clamp_radius: int = 0
 
 
 CHOICES: dict[str, range | tuple] = {
@@ -195,8 +211,28 @@ CHOICES: dict[str, range | tuple] = {
     "feedback_level": range(-1, 13),
     "light_cell": range(13),
     "variance": ("svgf", "temporal", "spatial"),
+    "reprojection": ("bilinear", "nearest"),
+    "fallback": (True, False),
+    "id_test": (True, False),
+    "warm_up": (True, False),
+    "clamp_radius": range(13),
 }
 """What each field of `Config` may be."""
+
+_READ_WHERE: dict[str, tuple[str, Any]] = {
+    "light_gain_threshold": ("light_cell", range(1, 13)),
+    "light_offset_threshold": ("light_cell", range(1, 13)),
+    "light_sigma_normal": ("light_cell", range(1, 13)),
+    "initial_variance": ("variance", ("temporal",)),
+    "variance_scale": ("variance", ("temporal",)),
+    "clamp_sigma": ("clamp_radius", range(1, 13)),
+}
+"""Parameters that are read only where a choice has one of some values."""
+
+
+def unread(config: Config) -> frozenset[str]:
+    """The parameters that nothing reads with these choices."""
+    return frozenset(name for name, (choice, values) in _READ_WHERE.items() if getattr(config, choice) not in values)
 
 
 def is_choice(name: str, value: Any) -> bool:

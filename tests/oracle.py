@@ -11,7 +11,7 @@ history: illumination [S, H, W, 3], moments [S, H, W, 2], history_length [H, W],
 output:  image [H, W, 3], illumination [S, H, W, 3], variance [S, H, W], variance_filtered [S, H, W],
          history_length [H, W], valid [H, W] (reprojection found history), rejected (dict of counts)
 params:  the names of `PAPER`; each a number or a list with one number per a-trous level
-config:  levels, feedback_level, and optionally variance ("svgf", "temporal", "spatial")
+config:  levels, feedback_level; and, where not the paper's: variance, reprojection, fallback, id_test, warm_up, clamp_radius
 """
 
 from math import exp, floor, isfinite, sqrt
@@ -33,6 +33,7 @@ PAPER = {
     "reproject_normal": 0.9,
     "kernel_near": 2 / 3,  # (1/4) / (3/8)
     "kernel_far": 1 / 6,  # (1/16) / (3/8)
+    "clamp_sigma": 1.0,
 }
 FALCOR = PAPER | {"alpha": 0.05, "sigma_luminance": 10.0, "short_history_boost": 4.0}
 PAPER_CONFIG = {"levels": 5, "feedback_level": 0}
@@ -115,7 +116,7 @@ def demodulate(radiance, albedo, albedo_floor):
 # Step 3
 
 
-def reproject_taps(frame, usable_motion, history, params):
+def reproject_taps(frame, usable_motion, history, params, config=PAPER_CONFIG):
     """For every pixel the list of (y, x, weight) in the previous frame that it continues, weights summing to 1."""
     height, width = frame["depth"].shape
     object_id, prev_id = frame["object_id"].tolist(), history["object_id"].tolist()
@@ -128,7 +129,8 @@ def reproject_taps(frame, usable_motion, history, params):
         return (
             0 <= qy < height
             and 0 <= qx < width
-            and prev_id[qy][qx] == object_id[y][x] != -1
+            and -1 not in (prev_id[qy][qx], object_id[y][x])
+            and (prev_id[qy][qx] == object_id[y][x] or not config.get("id_test", True))
             and abs(prev_z[qy][qx] - expected_z[y][x]) <= tolerance * max(expected_z[y][x], 1e-6)
             and dot(normal[y][x], prev_normal[qy][qx]) >= least_cosine
         )
@@ -141,15 +143,17 @@ def reproject_taps(frame, usable_motion, history, params):
             py, px = y + motion[y][x][1], x + motion[y][x][0]
             by, bx = floor(py), floor(px)
             fy, fx = py - by, px - bx
+            cy, cx = floor(py + 0.5), floor(px + 0.5)
             found = [
                 (by + j, bx + i, (fy if j else 1 - fy) * (fx if i else 1 - fx))
                 for j in (0, 1)
                 for i in (0, 1)
                 if consistent(y, x, by + j, bx + i)
             ]
+            if config.get("reprojection") == "nearest":
+                found = [(cy, cx, 1.0)] * consistent(y, x, cy, cx)
             if sum(weight for _, _, weight in found) < 0.01:
-                cy, cx = floor(py + 0.5), floor(px + 0.5)
-                found = [
+                found = config.get("fallback", True) * [
                     (cy + j, cx + i, 1.0) for j in (-1, 0, 1) for i in (-1, 0, 1) if consistent(y, x, cy + j, cx + i)
                 ]
             total = sum(weight for _, _, weight in found)
@@ -171,7 +175,18 @@ def gather(taps, values):
 # Step 4
 
 
-def accumulate(illumination, taps, history, surface, params):
+def clamped(old, color, surface, y, x, params, config):
+    """`old` [3] within mean +- clamp_sigma population standard deviations of the window around (y, x) of `color`."""
+    (height, width, _), r = color.shape, config.get("clamp_radius", 0)
+    if r == 0:
+        return old
+    rows, columns = range(max(y - r, 0), min(y + r + 1, height)), range(max(x - r, 0), min(x + r + 1, width))
+    window = np.array([color[qy, qx] for qy in rows for qx in columns if surface[qy][qx]])
+    mean, reach = window.mean(axis=0), first(params, "clamp_sigma") * window.std(axis=0)
+    return np.clip(old, mean - reach, mean + reach)
+
+
+def accumulate(illumination, taps, history, surface, params, config=PAPER_CONFIG):
     """Accumulated illumination [S, H, W, 3], moments [S, H, W, 2], history length [H, W], valid [H, W]."""
     signals, height, width, _ = illumination.shape
     prev_length = gather(taps, history["history_length"])
@@ -187,11 +202,13 @@ def accumulate(illumination, taps, history, surface, params):
             h, a, a_m = 1.0, 1.0, 1.0
             if valid[y, x]:
                 h = min(prev_length[y, x] + 1, first(params, "max_history"))
-                a = max(first(params, "alpha"), 1 / h)
-                a_m = max(first(params, "alpha_moments"), 1 / h)
+                least = 1 / h if config.get("warm_up", True) else 0.0
+                a = max(first(params, "alpha"), least)
+                a_m = max(first(params, "alpha_moments"), least)
             length[y, x] = h
             for s in range(signals):
-                accumulated[s, y, x] = (1 - a) * prev_illumination[s][y, x] + a * illumination[s, y, x]
+                old = clamped(prev_illumination[s][y, x], illumination[s], surface, y, x, params, config)
+                accumulated[s, y, x] = (1 - a) * old + a * illumination[s, y, x]
                 l = luminance(illumination[s, y, x])
                 moments[s, y, x] = (1 - a_m) * prev_moments[s][y, x] + a_m * np.array([l, l * l])
     return accumulated, moments, length, valid
@@ -363,8 +380,8 @@ def step(history, frame, params, config):
 
     illumination = demodulate(frame["radiance"], frame["albedo"], first(params, "albedo_floor"))
     illumination = np.where(has_surface[None, :, :, None], illumination, 0.0)
-    taps = reproject_taps(frame, usable_motion, history, params)
-    illumination, moments, length, valid = accumulate(illumination, taps, history, surface, params)
+    taps = reproject_taps(frame, usable_motion, history, params, config)
+    illumination, moments, length, valid = accumulate(illumination, taps, history, surface, params, config)
     gradient = depth_gradient(depth, frame["object_id"].tolist())
     estimator = config.get("variance", "svgf")
     variance = estimate_variance(moments, length, depth, normal, surface, gradient, params, estimator)
@@ -389,15 +406,8 @@ def step(history, frame, params, config):
         "valid": valid,
         "rejected": rejected,
     }
-    history = {
-        "illumination": feedback,
-        "moments": moments,
-        "history_length": length,
-        "depth": frame["depth"],
-        "normal": frame["normal"],
-        "object_id": frame["object_id"],
-    }
-    return history, output
+    history = {"illumination": feedback, "moments": moments, "history_length": length}
+    return history | {name: frame[name] for name in ("depth", "normal", "object_id")}, output
 
 
 def denoise(frames, params, config):

@@ -26,6 +26,7 @@ def test_the_public_names_are_these():
             "modulate",
             "reproject",
             "accumulate",
+            "clamp_history",
             "estimate_variance",
             "edge_weight",
         ),
@@ -84,6 +85,10 @@ def frame_of_zeros(signals=1, height=3, width=4):
         (
             lambda f: svgf_jax.step(svgf_jax.init(f), f, config=svgf_jax.Config(levels=-1)),
             "levels is -1; wanted a whole number from 0 to 12",
+        ),
+        (
+            lambda f: svgf_jax.step(svgf_jax.init(f), f, config=svgf_jax.Config(fallback=1)),
+            "fallback is 1; wanted true or false",
         ),
         (
             lambda f: svgf_jax.step(svgf_jax.init(f), f, params=svgf_jax.Params(alpha=np.ones(3))),

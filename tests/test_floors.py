@@ -10,6 +10,7 @@ FLOORS = [
     {"atomic"},
     {"types"},
     {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments"},
+    {"windows"},
     {"edges", "exr", "sanitation", "accumulation", "reprojection", "modulation", "sequences", "cameras"},
     {"variance", "atrous", "adaptation", "roles", "preview", "joint_bilateral"},
     {"frames", "references", "pipeline", "checkpoint"},

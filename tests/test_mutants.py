@@ -67,9 +67,18 @@ MUTANTS = {
     ),
     "alpha even without history": mutant(
         "accumulation",
-        "jnp.where(valid, jnp.maximum(alpha, 1.0 / jnp.maximum(length, 1.0)), 1.0)",
-        "alpha * jnp.ones_like(length)",
+        "jnp.where(valid, jnp.maximum(alpha, least), 1.0)",
+        "jnp.maximum(alpha, 0.0 * least)",
         "test_accumulate",
+    ),
+    "history not clamped": mutant("accumulation", "if not config.clamp_radius:", "if True:", "test_accumulate_as_chosen",
+                                  {"clamp_radius": 3}),
+    "deviation squared for the clamp": mutant(
+        "windows", "jnp.sqrt(jnp.where(varies, square, 1.0))", "square", "test_accumulate_as_chosen", {"clamp_radius": 3}
+    ),
+    "clamped to the light of the background": mutant(
+        "accumulation", "colors, frame.object_id != -1, radius", "colors, frame.object_id != -2, radius",
+        "test_accumulate_as_chosen", {"clamp_radius": 3},
     ),
     "moments of the accumulated light": mutant(
         "accumulation",
@@ -120,7 +129,7 @@ MUTANTS = {
         "jnp.floor(y).astype(jnp.int32), jnp.floor(x)", "test_reproject",
     ),
     "object ids not compared": mutant(
-        "reprojection", "(q_id == p[\"id\"])", "(q_id != -1)", "test_reproject_tells_objects_apart_by_id_alone"
+        "reprojection", "q_id == p[\"id\"] if config.id_test else q_id", "q_id", "test_reproject_tells_objects_apart_by_id_alone"
     ),
     "depth not compared": mutant(
         "reprojection", " & near & ", " & ", "test_reproject_compares_the_depth_that_the_surface_had"

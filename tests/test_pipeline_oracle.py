@@ -48,6 +48,12 @@ SYNTHETIC = {
         oracle.PAPER,
         {"levels": 2, "feedback_level": 7},
     ),
+    "the choices of temporal anti-aliasing": (
+        lambda: scenes.synthetic(18, 13, 17, frames=4, dirty=True),
+        oracle.PAPER | {"clamp_sigma": 0.7},
+        {"levels": 1, "feedback_level": 0, "clamp_radius": 3}
+        | {"reprojection": "nearest", "fallback": False, "id_test": False, "warm_up": False},
+    ),
     "no levels": (lambda: scenes.synthetic(16, 13, 17, frames=5), oracle.PAPER, {"levels": 0, "feedback_level": 0}),
     "rows that do not divide into strips": (
         lambda: scenes.synthetic(17, 73, 5, signals=1, frames=2),

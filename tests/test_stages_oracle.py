@@ -165,6 +165,51 @@ def test_reproject_compares_the_depth_that_the_surface_had():
     np.testing.assert_array_equal(got.valid, expected)
 
 
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"reprojection": "nearest"},
+        {"reprojection": "nearest", "fallback": False},
+        {"fallback": False},
+        {"id_test": False},
+    ],
+    ids=str,
+)
+def test_reproject_as_chosen(choices):
+    c, config = case(), CONFIG | choices
+    params = PARAMS | {"reproject_depth": 1.0, "reproject_normal": -0.5}  # so that ids matter
+    taps = oracle.reproject_taps(c.clean, c.usable, c.history, params, config)
+    assert taps != oracle.reproject_taps(c.clean, c.usable, c.history, params)
+    got = compiled(
+        reprojection.reproject,
+        to_history(c.history),
+        c.frame,
+        params=to_params(params),
+        config=to_config(config),
+        strip_rows=4,
+    )
+    np.testing.assert_array_equal(got.valid, [[bool(t) for t in row] for row in taps])
+    for s, signal in enumerate(c.history["illumination"]):
+        assert_close(got.illumination[s], oracle.gather(taps, signal))
+
+
+@pytest.mark.parametrize("choices", [{"warm_up": False}, {"clamp_radius": 1}, {"clamp_radius": 3}], ids=str)
+def test_accumulate_as_chosen(choices):
+    c, config = case(), CONFIG | choices
+    params = PARAMS | {"clamp_sigma": [0.4, 9.0]}
+    expected, moments, length, _ = oracle.accumulate(c.illumination, c.taps, c.history, c.surface, params, config)
+    assert np.abs(expected - c.accumulated).max() > 0.01
+
+    def stages(illumination, previous, frame, params, config):
+        previous = accumulation.clamp_history(previous, illumination, frame, params=params, config=config, strip_rows=4)
+        return accumulation.accumulate(illumination, previous, frame, params=params, config=config)
+
+    got = compiled(stages, c.illumination, c.previous, c.frame, params=to_params(params), config=to_config(config))
+    assert_close(got.illumination, expected)
+    assert_close(got.moments, moments)
+    assert_close(got.history_length, length)
+
+
 def test_accumulate():
     c = case()
     got = compiled(accumulation.accumulate, c.illumination, c.previous, c.frame, params=c.params)

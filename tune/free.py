@@ -15,6 +15,7 @@ from jax import Array
 
 from svgf_jax import Config, Params, SvgfError
 from svgf_jax.parameters import BOUNDS
+from svgf_jax.types import unread
 
 TUNED_BY_DEFAULT = (
     "alpha",
@@ -87,7 +88,7 @@ def choose(
 
     Args:
         params, config: the start.
-        names: parameters, or single levels of them (`sigma_luminance[2]`); `all` = every parameter.
+        names: parameters, or single levels of them (`sigma_luminance[2]`); `all` = every parameter that is read.
         per_level: True = one number a level for each of `names` that the a-trous levels read; or the names for which.
         freeze: names or labels taken off again.
 
@@ -95,9 +96,13 @@ def choose(
         SvgfError: unknown names, no such level, a parameter that has no levels, nothing left to tune.
     """
     names, freeze = tuple(names), tuple(freeze)
-    names = tuple(BOUNDS) if names == ("all",) else names
+    names = tuple(name for name in BOUNDS if name not in unread(config)) if names == ("all",) else names
     wanted = [(name, level) for name, level in map(_parse, names)]
     frozen = {_parse(name) for name in freeze}
+    if idle := [name for name, _ in wanted if name in unread(config)]:
+        raise SvgfError(
+            f"nothing reads {', '.join(idle)} with these choices: {config}; tune others, or change the choice"
+        )
     if per_level is True:
         split = set(PER_LEVEL)
     else:
