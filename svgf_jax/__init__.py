@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from svgf_jax.color import demodulate as demodulate
     from svgf_jax.color import luminance as luminance
     from svgf_jax.color import remodulate as remodulate
-    from svgf_jax.color import tonemap as tonemap
     from svgf_jax.demo import sample as sample
     from svgf_jax.edges import Guides as Guides
     from svgf_jax.edges import depth_gradient as depth_gradient
@@ -47,6 +46,10 @@ if TYPE_CHECKING:
     from svgf_jax.references import read_radiance as read_radiance
     from svgf_jax.reprojection import reproject as reproject
     from svgf_jax.sanitation import sanitise as sanitise
+    from svgf_jax.tonemapping import decode_srgb as decode_srgb
+    from svgf_jax.tonemapping import encode_srgb as encode_srgb
+    from svgf_jax.tonemapping import tonemap as tonemap
+    from svgf_jax.tonemapping import untonemap as untonemap
     from svgf_jax.types import Config as Config
     from svgf_jax.types import Frame as Frame
     from svgf_jax.types import History as History
@@ -62,7 +65,7 @@ __version__ = "0.1.0"
 _HOME = {
     "accumulation": ["Accumulated", "accumulate", "clamp_history"],
     "atrous": ["atrous_filter", "atrous_level"],
-    "color": ["demodulate", "luminance", "remodulate", "tonemap"],
+    "color": ["demodulate", "luminance", "remodulate"],
     "demo": ["sample"],
     "edges": ["Guides", "depth_gradient", "edge_weight", "guides_of"],
     "frames": ["load_sequence", "open_source", "read_frame"],
@@ -77,6 +80,7 @@ _HOME = {
     "references": ["load_reference", "read_radiance"],
     "reprojection": ["reproject"],
     "sanitation": ["sanitise"],
+    "tonemapping": ["decode_srgb", "encode_srgb", "tonemap", "untonemap"],
     "types": ["Config", "Frame", "History", "Output", "Params", "Rejected", "Reprojected", "SvgfError"],
     "variance": ["estimate_variance"],
 }

@@ -1,4 +1,4 @@
-"""Colour arithmetic: luminance, demodulation by albedo, tone mapping."""
+"""Colour arithmetic: luminance, and demodulation by albedo."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -41,9 +41,3 @@ def demodulate(radiance: Array, albedo: Array, *, albedo_floor: Array | float = 
 def remodulate(illumination: Array, albedo: Array, *, albedo_floor: Array | float = 1e-3) -> Array:
     """The inverse of `demodulate`, with the same floor, so that an identity filter is lossless. Shapes as there."""
     return illumination * jnp.maximum(albedo, albedo_floor)
-
-
-def tonemap(color: Array) -> Array:
-    """Reinhard's x / (1 + x) per channel, negatives as 0: linear `[...]` -> [0, 1)."""
-    positive = jnp.maximum(color, 0.0)
-    return positive / (1.0 + positive)

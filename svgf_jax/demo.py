@@ -84,6 +84,6 @@ def _panels(out: str | Path, frame: int | None = None) -> Iterator[np.ndarray]:
     }
     for files in zip(*(sequence.files for sequence in columns.values()), strict=True):
         if frame is None or files[0][0] == frame:
-            pictures = [preview.tonemap(read_radiance(str(path)), exposure=EXPOSURE) for _, path in files]
+            pictures = [preview.to_8bit(read_radiance(str(path)), exposure=EXPOSURE) for _, path in files]
             large = [picture.repeat(ZOOM, axis=0).repeat(ZOOM, axis=1) for picture in pictures]
             yield preview.side_by_side(list(zip(columns, large, strict=True)))

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from svgf_jax.tonemapping import tonemap
 from svgf_jax.types import SvgfError
 
 SSIM_SIGMA, SSIM_RADIUS = 1.5, 5  # 11 x 11 Gaussian window, Wang et al. 2004
@@ -40,7 +41,7 @@ _TEMPORAL = Scores._fields.index("temporal")
 
 def display(image: np.ndarray) -> np.ndarray:
     """`x / (1 + x)` of scene-linear `image`, negative values taken as 0: float64 in [0, 1]; +inf gives 1, nan nan."""
-    return 1.0 - 1.0 / (1.0 + np.maximum(np.asarray(image, np.float64), 0.0))
+    return tonemap(np.asarray(image, np.float64))
 
 
 def psnr(image: np.ndarray, reference: np.ndarray) -> float:

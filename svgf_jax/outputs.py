@@ -23,6 +23,7 @@ class WriteOptions(NamedTuple):
         diagnostics: add the layers `svgf.variance.*`, `svgf.history_length`, `svgf.valid`.
         png: also write a tone-mapped PNG beside each EXR.
         exposure: factor on the radiance in previews, > 0.
+        tonemap: the tone curve of previews, a name of `tonemapping.CURVES`.
     """
 
     full_float: bool = False
@@ -31,6 +32,7 @@ class WriteOptions(NamedTuple):
     diagnostics: bool = False
     png: bool = False
     exposure: float = 1.0
+    tonemap: str = preview.CURVE
 
 
 def numbers(params: Params, config: Config) -> dict[str, Any]:
@@ -91,7 +93,9 @@ def write_frame(path: Path, image: exr.Image, *, options: WriteOptions) -> tuple
     """
     dropped = exr.write(path, image, compression=options.compression)
     if options.png:
-        preview.write_png(path.with_suffix(".png"), preview.tonemap(beauty(image), exposure=options.exposure))
+        preview.write_png(
+            path.with_suffix(".png"), preview.to_8bit(beauty(image), exposure=options.exposure, curve=options.tonemap)
+        )
     return dropped
 
 

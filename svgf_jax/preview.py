@@ -9,29 +9,21 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from svgf_jax import atomic
+from svgf_jax import atomic, tonemapping
 from svgf_jax.types import SvgfError
 
-WHITE = 4.0  # radiance that becomes full white (at exposure 1)
+CURVE = "reinhard-extended"  # what pictures are shown in unless another is asked for
 
 
-def tonemap(image: np.ndarray, *, exposure: float = 1.0) -> np.ndarray:
-    """Scene-linear `[H, W, 3]` to 8-bit sRGB `[H, W, 3]` uint8.
+def to_8bit(image: np.ndarray, *, exposure: float = 1.0, curve: str = CURVE) -> np.ndarray:
+    """Scene-linear `[H, W, 3]` to 8-bit sRGB `[H, W, 3]` uint8: exposure, a curve of `tonemapping`, the sRGB curve.
 
-    Extended Reinhard (2002, eq. 4) on each channel, `x (1 + x / WHITE^2) / (1 + x)`, then the sRGB curve. `exposure` is
-    a factor on the radiance, > 0. Negative and nan count as 0; everything from WHITE on is 255.
+    `exposure` is a factor on the radiance, > 0. Negative and nan count as 0, infinity is white.
     """
-    check_exposure(exposure)
-    linear = np.clip(np.nan_to_num(np.asarray(image, np.float32)), 0, WHITE / exposure) * exposure
-    curve = linear * (1 + linear / WHITE**2) / (1 + linear)
-    srgb = np.where(curve <= 0.0031308, 12.92 * curve, 1.055 * np.maximum(curve, 0.0031308) ** (1 / 2.4) - 0.055)
-    return (srgb * 255 + 0.5).astype(np.uint8)
-
-
-def check_exposure(exposure: float) -> None:
-    """Raise `SvgfError` for an exposure that `tonemap` does not take."""
-    if not (np.isfinite(exposure) and exposure > 0):
-        raise SvgfError(f"Got the exposure {exposure}; wanted a finite number above 0, for example 1 (no change) or 2.")
+    tonemapping.check_exposure(exposure)
+    linear = np.nan_to_num(np.asarray(image, np.float32))
+    shown = tonemapping.encode_srgb(tonemapping.tonemap(linear, curve=curve, exposure=exposure))
+    return (shown * 255 + 0.5).astype(np.uint8)
 
 
 def frame_rate(fps: float) -> Fraction:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from svgf_jax import __version__, checkpoint, exr, frames, outputs, preview
+from svgf_jax import __version__, checkpoint, exr, frames, outputs, preview, tonemapping
 from svgf_jax.checkpoint import Checkpoint
 from svgf_jax.compiled import Filters, Pipeline, compile_filters, to_host
 from svgf_jax.outputs import WriteOptions
@@ -116,7 +116,7 @@ def run(
     began = time.monotonic()
     if checkpoint_every < 1 or threads < 1:
         raise SvgfError(f"Got checkpoint_every {checkpoint_every} and threads {threads}; wanted at least 1 of each.")
-    preview.check_exposure(options.exposure)
+    tonemapping.check_exposure(options.exposure)
     preview.frame_rate(fps)
     if video:
         preview.require_video()
@@ -158,7 +158,7 @@ def run(
                 end = _filter(plan, start, loaded, filters, write, submit, stop, checkpoint_every)
         if start is not None and end == len(plan.files):
             if plan.video is not None:
-                preview.write_video(plan.video, _pictures(plan, options.exposure), fps=fps)
+                preview.write_video(plan.video, _pictures(plan, options), fps=fps)
             checkpoint.save_run(plan.out, plan.identity, complete=True)
             checkpoint.remove_checkpoint(plan.out)
     return Summary(
@@ -285,11 +285,11 @@ def _fill_gap(plan: Plan, index: int) -> FrameReport:
     return FrameReport(number, "held", path, {}, ())
 
 
-def _pictures(plan: Plan, exposure: float) -> Iterator[np.ndarray]:
+def _pictures(plan: Plan, options: WriteOptions) -> Iterator[np.ndarray]:
     """The outputs as 8-bit pictures, read back one at a time."""
     for path in plan.outputs:
         if path is not None:
-            yield preview.tonemap(outputs.beauty(exr.read(path)), exposure=exposure)
+            yield preview.to_8bit(outputs.beauty(exr.read(path)), exposure=options.exposure, curve=options.tonemap)
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"atomic"},
     {"types"},
+    {"tonemapping"},
     {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments"},
     {"windows"},
     {"edges", "exr", "sanitation", "accumulation", "reprojection", "modulation", "sequences", "cameras"},
@@ -35,6 +36,7 @@ NUMPY_ONLY = {
     "references",
     "frames",
     "preview",
+    "tonemapping",
 }
 
 

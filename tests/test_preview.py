@@ -4,36 +4,36 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from svgf_jax import preview
+from svgf_jax import preview, tonemapping
 from svgf_jax.types import SvgfError
 
 
 def test_tonemap_goes_from_black_to_white_monotonically():
     ramp = np.repeat(np.linspace(-1, 6, 400, dtype=np.float32)[None, :, None], 3, 2)
-    shown = preview.tonemap(ramp)
+    shown = preview.to_8bit(ramp)
     assert shown.dtype == np.uint8
     assert shown.shape == (1, 400, 3)
     assert (np.diff(shown[0, :, 0].astype(int)) >= 0).all()
     assert (shown[ramp <= 0] == 0).all()
-    assert (shown[ramp >= preview.WHITE] == 255).all()
+    assert (shown[ramp >= tonemapping.WHITE] == 255).all()
 
 
 def test_tonemap_of_a_hand_computed_value():
     curve = 0.5 * (1 + 0.5 / 16) / 1.5
-    assert preview.tonemap(np.full((1, 1, 3), 0.25), exposure=2.0)[0, 0, 0] == round(
+    assert preview.to_8bit(np.full((1, 1, 3), 0.25), exposure=2.0)[0, 0, 0] == round(
         255 * (1.055 * curve ** (1 / 2.4) - 0.055)
     )
 
 
 def test_tonemap_survives_anything():
     image = np.array([[[np.nan, np.inf, -np.inf]]])
-    assert preview.tonemap(image, exposure=3.0).tolist() == [[[0, 255, 0]]]
+    assert preview.to_8bit(image, exposure=3.0).tolist() == [[[0, 255, 0]]]
 
 
 @pytest.mark.parametrize("exposure", [0, -1, np.nan, np.inf])
 def test_tonemap_refuses_a_senseless_exposure(exposure):
     with pytest.raises(SvgfError, match="exposure"):
-        preview.tonemap(np.zeros((1, 1, 3)), exposure=exposure)
+        preview.to_8bit(np.zeros((1, 1, 3)), exposure=exposure)
 
 
 def test_side_by_side_keeps_the_pictures_and_draws_labels():

@@ -11,7 +11,7 @@ import numpy as np
 
 from svgf_jax import Config, Params, SvgfError
 from svgf_jax.metrics import psnr
-from svgf_jax.preview import tonemap, write_png
+from svgf_jax.preview import to_8bit, write_png
 from tune.evaluate import filtered
 from tune.explore import Profile, Sensitivity
 from tune.fitting import Fit
@@ -158,7 +158,7 @@ def _slider(compared: Comparison, start: Params, config: Config, found: Fit) -> 
         return picture, target
 
     (before, target), (after, _) = image(start, config), image(found.params, found.config)
-    one, other, wanted = (_png(tonemap(picture)) for picture in (before, after, target))
+    one, other, wanted = (_png(to_8bit(picture)) for picture in (before, after, target))
     names = f"before ({psnr(before, target):.2f} dB, left) and after ({psnr(after, target):.2f} dB, right)"
 
     def pair(right: str, left: str, caption: str) -> str:

@@ -43,6 +43,7 @@ def denoise(
     video: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
     fps: Annotated[float, Parameter(group=OUTPUT)] = 24.0,
     exposure: Annotated[float, Parameter(group=OUTPUT)] = 1.0,
+    tonemap: Annotated[settings.Tonemap, Parameter(group=OUTPUT)] = "reinhard-extended",
     overwrite: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     resume: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     checkpoint_every: Annotated[int, Parameter(metavar="FRAMES", group=RUN)] = 8,
@@ -71,6 +72,7 @@ def denoise(
         video: Also write an MP4 of the whole (needs the extra `video`).
         fps: Frames per second of the video.
         exposure: Brightness factor of PNG and video.
+        tonemap: Tone curve of PNG and video.
         overwrite: Replace outputs that exist.
         resume: Continue an interrupted run where its last checkpoint is; the result is the same bit for bit.
         checkpoint_every: Save the history for --resume after so many frames.
@@ -107,7 +109,7 @@ def denoise(
             params=chosen,
             config=config,
             preset=chosen_preset,
-            options=WriteOptions(float_, compression, only_denoised, diagnostics, png, exposure),
+            options=WriteOptions(float_, compression, only_denoised, diagnostics, png, exposure, tonemap),
             video=video,
             fps=fps,
             resume=resume,

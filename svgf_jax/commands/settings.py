@@ -2,9 +2,11 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from svgf_jax.types import CHOICES, Config, Params, SvgfError, choices_of
+
+Tonemap = Literal["reinhard-extended", "reinhard", "aces-narkowicz", "aces-hill", "linear"]  # tonemapping.CURVES
 
 
 def choose(preset: str | None, file: Path | None, changes: Iterable[str]) -> tuple[str, Params, Config]:
