@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from svgf_jax.accumulation import Accumulated as Accumulated
     from svgf_jax.accumulation import accumulate as accumulate
     from svgf_jax.accumulation import clamp_history as clamp_history
+    from svgf_jax.antialiasing import taa as taa
+    from svgf_jax.antialiasing import taa_init as taa_init
     from svgf_jax.atrous import atrous_filter as atrous_filter
     from svgf_jax.atrous import atrous_level as atrous_level
     from svgf_jax.color import demodulate as demodulate
@@ -58,12 +60,14 @@ if TYPE_CHECKING:
     from svgf_jax.types import Rejected as Rejected
     from svgf_jax.types import Reprojected as Reprojected
     from svgf_jax.types import SvgfError as SvgfError
+    from svgf_jax.types import TaaHistory as TaaHistory
     from svgf_jax.variance import estimate_variance as estimate_variance
 
 __version__ = "0.1.0"
 
 _HOME = {
     "accumulation": ["Accumulated", "accumulate", "clamp_history"],
+    "antialiasing": ["taa", "taa_init"],
     "atrous": ["atrous_filter", "atrous_level"],
     "color": ["demodulate", "luminance", "remodulate"],
     "demo": ["sample"],
@@ -81,7 +85,7 @@ _HOME = {
     "reprojection": ["reproject"],
     "sanitation": ["sanitise"],
     "tonemapping": ["decode_srgb", "encode_srgb", "tonemap", "untonemap"],
-    "types": ["Config", "Frame", "History", "Output", "Params", "Rejected", "Reprojected", "SvgfError"],
+    "types": ["Config", "Frame", "History", "Output", "Params", "Rejected", "Reprojected", "SvgfError", "TaaHistory"],
     "variance": ["estimate_variance"],
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}

@@ -45,7 +45,7 @@ def check_frame(frame: Frame) -> None:
             )
 
 
-def check_history(history: History, frame: Frame) -> None:
+def check_history(history: History, frame: Frame, config: Config) -> None:
     """Raise `SvgfError` unless the history belongs to frames of this size, dtype and number of signals."""
     signals, height, width, _ = frame.radiance.shape
     shapes = {
@@ -56,7 +56,16 @@ def check_history(history: History, frame: Frame) -> None:
         "normal": (height, width, 3),
         "object_id": (height, width),
     }
-    for name, leaf in history._asdict().items():
+    if (history.taa is not None) != config.taa:
+        raise SvgfError(
+            f"the history {'lacks' if config.taa else 'has'} a past for temporal anti-aliasing, and taa is {config.taa}; "
+            "wanted a history that was started with the same choices: init(frame, config=config)"
+        )
+    if history.taa is not None and tuple(history.taa.color.shape) != (height, width, 3):
+        raise SvgfError(f"the history's taa is of {tuple(history.taa.color.shape)}; wanted {(height, width, 3)}")
+    for name, leaf in history._replace(taa=None)._asdict().items():
+        if leaf is None:
+            continue
         dtype = jnp.int32 if name == "object_id" else frame.radiance.dtype
         if tuple(leaf.shape) != shapes[name] or leaf.dtype != dtype:
             raise SvgfError(

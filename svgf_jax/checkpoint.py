@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from svgf_jax import atomic
-from svgf_jax.types import History, SvgfError
+from svgf_jax.types import History, SvgfError, TaaHistory
 
 FOLDER = ".svgf-jax"
 FORMAT = 1  # of the files in FOLDER
@@ -83,7 +83,7 @@ def load_run(out: Path) -> tuple[Identity, bool] | None:
 
 def save_checkpoint(out: Path, identity: Identity, checkpoint: Checkpoint) -> None:
     """Replace the checkpoint in `out`. Only to be called when every output before `next_index` is on disk."""
-    arrays = {} if checkpoint.history is None else checkpoint.history._asdict()
+    arrays = {} if checkpoint.history is None else _flat(checkpoint.history)
     entries = {
         **{name: np.asarray(array) for name, array in arrays.items()},
         "format": np.asarray(FORMAT),
@@ -106,15 +106,31 @@ def load_checkpoint(out: Path, identity: Identity) -> Checkpoint | None:
             raise ValueError(f"format {entries['format']}, wanted {FORMAT}")
         next_index = int(entries["next_index"])
         saved = json.loads(entries["identity"].tobytes().decode())
-        arrays = [entries[name] for name in History._fields if name in entries]
-        if len(arrays) not in (0, len(History._fields)) or not 0 <= next_index <= len(saved["frames"]):
+        history = _unflat(entries)
+        if not 0 <= next_index <= len(saved["frames"]):
             raise ValueError("incomplete")
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise _unusable(path, error) from error
     check_same(out, saved, identity, used=next_index)
-    return Checkpoint(next_index, History(*arrays) if arrays else None)
+    return Checkpoint(next_index, history)
+
+
+def _flat(history: History) -> dict[str, Any]:
+    """The history's arrays by name, those of anti-aliasing as `taa.NAME`; what is None has none."""
+    taa = {} if history.taa is None else history.taa._asdict()
+    named = history._asdict() | {"taa": None} | {f"taa.{name}": array for name, array in taa.items()}
+    return {name: array for name, array in named.items() if array is not None}
+
+
+def _unflat(entries: dict[str, Any]) -> History | None:
+    """The inverse of `_flat`, None where there is no history; ValueError where arrays are missing."""
+    arrays = {name: entries[name] for name in History._fields if name in entries}
+    taa = {name: entries[f"taa.{name}"] for name in TaaHistory._fields if f"taa.{name}" in entries}
+    if len(arrays) not in (0, len(History._fields) - 1) or len(taa) not in (0, len(TaaHistory._fields)):
+        raise ValueError("incomplete")
+    return History(**arrays, taa=TaaHistory(**taa) if taa else None) if arrays else None
 
 
 def check_same(out: Path, saved: Identity, identity: Identity, *, used: int) -> None:

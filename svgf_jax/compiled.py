@@ -1,7 +1,7 @@
 """The filter compiled for a device, with its parameters there. Imports JAX when first used, not before."""
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,7 +46,8 @@ def _jitted(init: Callable[..., History], step: Callable[..., Any], config: Conf
     """Compiled once a process, however many sequences it denoises."""
     import jax
 
-    return jax.jit(init), jax.jit(lambda history, frame, params: step(history, frame, params=params, config=config))
+    start = partial(init, config=config) if config.taa else init  # other pipelines know nothing of it
+    return jax.jit(start), jax.jit(lambda history, frame, params: step(history, frame, params=params, config=config))
 
 
 def _device(name: str | None) -> Any:

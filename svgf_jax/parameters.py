@@ -62,6 +62,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "initial_variance": _NOT_NEGATIVE,
     "variance_scale": _NOT_NEGATIVE,
     "clamp_sigma": _NOT_NEGATIVE,
+    "taa_alpha": (0.0, 1.0),
 }
 
 

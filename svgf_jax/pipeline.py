@@ -8,6 +8,7 @@ from jax import lax
 
 from svgf_jax.accumulation import accumulate, clamp_history
 from svgf_jax.adaptation import follow_light
+from svgf_jax.antialiasing import taa, taa_init
 from svgf_jax.atrous import atrous_filter
 from svgf_jax.check import check_frame, check_history, check_params, check_sequence
 from svgf_jax.color import demodulate
@@ -18,8 +19,8 @@ from svgf_jax.types import Config, Frame, History, Output, Params, at_level
 from svgf_jax.variance import estimate_variance
 
 
-def init(frame: Frame) -> History:
-    """The empty history that a sequence starts with. Only the shapes and the dtype of `frame` matter."""
+def init(frame: Frame, *, config: Config = Config()) -> History:
+    """The empty history that a sequence starts with. Only the shapes and the dtype of `frame` matter, and `config.taa`."""
     check_frame(frame)
     signals, height, width, _ = frame.radiance.shape
     dtype = frame.radiance.dtype
@@ -30,6 +31,7 @@ def init(frame: Frame) -> History:
         depth=jnp.zeros((height, width), dtype),
         normal=jnp.zeros((height, width, 3), dtype),
         object_id=jnp.full((height, width), -1, jnp.int32),
+        taa=taa_init(frame.emission) if config.taa else None,
     )
 
 
@@ -40,7 +42,7 @@ def step(
     """Filter one frame.
 
     Args:
-        history: of the frame before; `init(frame)` at the start or after a cut.
+        history: of the frame before; `init(frame, config=config)` at the start or after a cut.
         frame: one frame, float32 or float64 throughout; shapes and units as in `Frame`. Bad pixels are repaired and counted.
         params: the filter's numbers, traced: scalars or one value per a-trous level.
         config: the filter's static choices.
@@ -53,10 +55,11 @@ def step(
     """
     history, frame = jax.tree.map(jnp.asarray, (history, frame))
     check_frame(frame)
-    check_history(history, frame)
+    check_history(history, frame, config)
     params = check_params(params, config, dtype=frame.radiance.dtype)
     floor = at_level(params, 0).albedo_floor
 
+    motion = frame.motion  # the background's too
     frame, rejected = sanitise(frame)
     illumination = demodulate(frame.radiance, frame.albedo, albedo_floor=floor)
     previous = reproject(history, frame, params=params, config=config)
@@ -68,6 +71,10 @@ def step(
         accumulated.illumination, variance, frame, params=params, config=config
     )
     image = modulate(filtered, frame, albedo_floor=floor)
+    past, display = history.taa, None
+    if past is not None:
+        past, image = taa(past, image, motion, frame.depth, params=params)
+        display = past.color
 
     history = History(
         illumination=feedback,
@@ -76,6 +83,7 @@ def step(
         depth=frame.depth,
         normal=frame.normal,
         object_id=frame.object_id,
+        taa=past,
     )
     return history, Output(
         image=image,
@@ -85,6 +93,7 @@ def step(
         history_length=accumulated.history_length,
         valid=previous.valid,
         rejected=rejected,
+        display=display,
     )
 
 
@@ -104,7 +113,7 @@ def denoise(
     """
     check_sequence(frames)
     if history is None:
-        history = init(jax.tree.map(lambda a: a[0], frames))
+        history = init(jax.tree.map(lambda a: a[0], frames), config=config)
     # Recompute a frame in reverse mode rather than store what happened inside it.
     body = jax.checkpoint(partial(step, params=params, config=config), prevent_cse=False)
     return lax.scan(body, history, frames)

@@ -85,6 +85,22 @@ def untonemap(display: Array, *, curve: str = "reinhard", exposure: float = 1.0)
     return (x if c.before is None else _transform(x, _inverse(c.before))) / exposure
 
 
+def compress_luma(color: tuple[Array, ...]) -> tuple[Array, ...]:
+    """c / (1 + luma) of the planes red, green and blue, luma = (R + 2 G + B) / 4, below 0 taken as 0 (Karis 2013).
+
+    Reversible, keeps the hue, and has a luma below 1; a saturated channel may be larger.
+    """
+    scale = 1.0 + _luma(color)
+    return tuple(c / scale for c in color)
+
+
+def expand_luma(color: tuple[Array, ...]) -> tuple[Array, ...]:
+    """The inverse of `compress_luma`; finite for a luma of 1 and above too."""
+    eps = float(np.finfo(color[0].dtype).eps)
+    scale = _module(color[0]).maximum(1.0 - _luma(color), eps)
+    return tuple(c / scale for c in color)
+
+
 def encode_srgb(linear: Array) -> Array:
     """Display-linear [0, 1] to the sRGB code value [0, 1] (IEC 61966-2-1)."""
     xp = _module(linear)
@@ -102,6 +118,11 @@ def check_exposure(exposure: float) -> None:
     """Raise `SvgfError` for an exposure that means nothing."""
     if not (np.isfinite(exposure) and exposure > 0):
         raise SvgfError(f"Got the exposure {exposure}; wanted a finite number above 0, for example 1 (no change) or 2.")
+
+
+def _luma(color: tuple[Array, ...]) -> Array:
+    red, green, blue = color
+    return _module(red).maximum(0.25 * red + 0.5 * green + 0.25 * blue, 0.0)
 
 
 def _curve(name: str) -> Curve:

@@ -48,6 +48,18 @@ class Frame(NamedTuple):
     variance: Array | None = None
 
 
+class TaaHistory(NamedTuple):
+    """What temporal anti-aliasing needs of the past.
+
+    Attributes:
+        color: `[H, W, 3]`, the frame before, anti-aliased, on the tone curve c / (1 + luma): its display image.
+        frames: how many frames went into it, a scalar of the image's dtype; 0 = none.
+    """
+
+    color: Array
+    frames: Array
+
+
 class History(NamedTuple):
     """What the next frame needs of the past.
 
@@ -56,6 +68,7 @@ class History(NamedTuple):
         moments: `[S, H, W, 2]`, accumulated first and second moment of the illumination's luminance.
         history_length: `[H, W]`, frames accumulated, a real number in [0, max_history]; 0 = no history.
         depth, normal, object_id: the sanitised guides of the frame that this history ends with.
+        taa: what temporal anti-aliasing remembers; None where `Config.taa` is off.
     """
 
     illumination: Array
@@ -64,6 +77,7 @@ class History(NamedTuple):
     depth: Array
     normal: Array
     object_id: Array
+    taa: TaaHistory | None = None
 
 
 class Reprojected(NamedTuple):
@@ -104,13 +118,14 @@ class Output(NamedTuple):
     """What a frame gives to the world.
 
     Attributes:
-        image: `[H, W, 3]`, the filtered beauty, scene-linear.
+        image: `[H, W, 3]`, the filtered beauty, scene-linear; anti-aliased where `Config.taa` is on.
         illumination: `[S, H, W, 3]`, the filtered demodulated signals.
         variance: `[S, H, W]`, luminance variance before the a-trous filter.
         variance_filtered: `[S, H, W]`, the same after its last level.
         history_length: `[H, W]`, frames accumulated, this one included; 0 where there is no surface.
         valid: `[H, W]` bool, whether reprojection found history.
         rejected: counts of repaired pixels.
+        display: `[H, W, 3]`, the anti-aliased image on its tone curve, c / (1 + luma); None where `Config.taa` is off.
     """
 
     image: Array
@@ -120,6 +135,7 @@ class Output(NamedTuple):
     history_length: Array
     valid: Array
     rejected: Rejected
+    display: Array | None = None
 
 
 class Params(NamedTuple):
@@ -152,6 +168,7 @@ class Params(NamedTuple):
         variance_scale: factor on the temporal variance, >= 0.
         clamp_sigma: standard deviations that the history may lie off this frame's mean, >= 0. Read only where
             `clamp_radius` > 0.
+        taa_alpha: least weight of the new frame in temporal anti-aliasing, in [0, 1]. Read only where `taa` is on.
     """
 
     alpha: Any = 0.2
@@ -174,6 +191,7 @@ class Params(NamedTuple):
     initial_variance: Any = 100.0
     variance_scale: Any = 100.0
     clamp_sigma: Any = 1.0
+    taa_alpha: Any = 0.1
 
 
 class Config(NamedTuple):
@@ -193,6 +211,7 @@ class Config(NamedTuple):
             holds from the second frame on.
         clamp_radius: clamp the history to mean +- clamp_sigma standard deviations of this frame's illumination over
             a window of this radius (3 = 7 x 7); 0 = do not.
+        taa: temporal anti-aliasing of the image, after everything else.
     """
 
     levels: int = 5
@@ -204,6 +223,7 @@ class Config(NamedTuple):
     id_test: bool = True
     warm_up: bool = True
     clamp_radius: int = 0
+    taa: bool = False
 
 
 CHOICES: dict[str, range | tuple] = {
@@ -216,6 +236,7 @@ CHOICES: dict[str, range | tuple] = {
     "id_test": (True, False),
     "warm_up": (True, False),
     "clamp_radius": range(13),
+    "taa": (False, True),
 }
 """What each field of `Config` may be."""
 
@@ -226,6 +247,7 @@ _READ_WHERE: dict[str, tuple[str, Any]] = {
     "initial_variance": ("variance", ("temporal",)),
     "variance_scale": ("variance", ("temporal",)),
     "clamp_sigma": ("clamp_radius", range(1, 13)),
+    "taa_alpha": ("taa", (True,)),
 }
 """Parameters that are read only where a choice has one of some values."""
 

@@ -8,7 +8,7 @@ import pytest
 from svgf_jax import checkpoint
 from svgf_jax.checkpoint import Checkpoint
 from svgf_jax.plan import begin, make_plan, written
-from svgf_jax.types import History, SvgfError
+from svgf_jax.types import History, SvgfError, TaaHistory
 
 RNG = np.random.default_rng(0)
 HISTORY = History(
@@ -28,11 +28,16 @@ def out(tmp_path):
         yield tmp_path / "out"
 
 
-def test_round_trip_is_exact(out):
-    checkpoint.save_checkpoint(out, IDENTITY, Checkpoint(1, HISTORY))
+TAA = TaaHistory(RNG.random((4, 5, 3), np.float32), np.float32(3))
+
+
+@pytest.mark.parametrize("wanted", [HISTORY, HISTORY._replace(taa=TAA)], ids=["plain", "anti-aliased"])
+def test_round_trip_is_exact(out, wanted):
+    checkpoint.save_checkpoint(out, IDENTITY, Checkpoint(1, wanted))
     index, history = checkpoint.load_checkpoint(out, IDENTITY)
     assert index == 1
-    for saved, loaded in zip(HISTORY, history, strict=True):
+    assert type(history.taa) is type(wanted.taa)
+    for saved, loaded in zip((*wanted[:-1], *(wanted.taa or ())), (*history[:-1], *(history.taa or ())), strict=True):
         assert saved.dtype == loaded.dtype
         np.testing.assert_array_equal(saved, loaded)
 

@@ -12,7 +12,17 @@ FLOORS = [
     {"tonemapping"},
     {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments"},
     {"windows"},
-    {"edges", "exr", "sanitation", "accumulation", "reprojection", "modulation", "sequences", "cameras"},
+    {
+        "edges",
+        "exr",
+        "sanitation",
+        "accumulation",
+        "reprojection",
+        "modulation",
+        "antialiasing",
+        "sequences",
+        "cameras",
+    },
     {"variance", "atrous", "adaptation", "roles", "preview", "joint_bilateral"},
     {"frames", "references", "pipeline", "checkpoint"},
     {"compiled", "comparison", "outputs", "plan"},
@@ -22,7 +32,16 @@ FLOORS = [
     {"cli"},
     {"__main__"},
 ]
-STAGES = {"sanitation", "reprojection", "accumulation", "adaptation", "variance", "atrous", "joint_bilateral"}
+STAGES = {
+    "sanitation",
+    "reprojection",
+    "accumulation",
+    "adaptation",
+    "variance",
+    "atrous",
+    "joint_bilateral",
+    "antialiasing",
+}
 NUMPY_ONLY = {
     "atomic",
     "types",

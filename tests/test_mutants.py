@@ -276,6 +276,21 @@ MUTANTS = {
     "depth differences across objects": mutant(
         "edges", "(shift(object_id, sign * dy, sign * dx) == object_id) & ", "", "test_depth_gradient"
     ),
+    # Temporal anti-aliasing
+    "each pixel's own motion": mutant(
+        "antialiasing", "q[\"near\"] > nearest", "(q[\"near\"] > nearest) & (nearest < 0)", "test_taa"
+    ),
+    "history not clipped": mutant("antialiasing", "m + d / outside", "m + d", "test_taa"),
+    "history clamped channel by channel": mutant(
+        "antialiasing", "m + d / outside for m, d in zip(centre, away, strict=True)",
+        "m + jnp.clip(d, -r, r) for m, d, r in zip(centre, away, reach, strict=True)", "test_taa",
+    ),
+    "anti-aliasing blended the wrong way round": mutant(
+        "antialiasing", "(1.0 - a) * old + a * new", "(1.0 - a) * new + a * old", "test_taa"
+    ),
+    "bright pixels not weighed down": mutant(
+        "tonemapping", "scale = 1.0 + _luma(color)", "scale = 1.0 + 0.0 * _luma(color)", "test_taa"
+    ),
     # Sanitising and the whole
     "infinite radiance kept": mutant(
         "sanitation", "radiance_finite & radiance_positive, frame", "~jnp.isnan(frame.radiance) & radiance_positive, frame",

@@ -9,12 +9,13 @@ import types
 import jax
 import numpy as np
 import oracle
+import oracle_taa
 import pytest
 import scenes
 from bridge import QUICK, relative_error, to_config, to_frame, to_history, to_params
 
-from svgf_jax import accumulation, atrous, color, edges, pipeline, reprojection, sanitation, variance
-from svgf_jax.types import Reprojected
+from svgf_jax import accumulation, antialiasing, atrous, color, edges, pipeline, reprojection, sanitation, variance
+from svgf_jax.types import Reprojected, TaaHistory
 
 SIZE = (11, 14)
 CONFIG = {"levels": 2, "feedback_level": 0}
@@ -375,3 +376,29 @@ def test_background_keeps_its_radiance():
     _, got = compiled(pipeline.step, history, to_frame(raw), params=case().params, config=config)
     background = raw["object_id"] == -1
     assert_close(got.image[background], (1.0 + raw["emission"])[background])
+
+
+def taa_case(seed=0):
+    """Noise with a few very bright pixels, fractional motion, motion out of the image and broken motion, things before things."""
+    rng = np.random.default_rng(seed)
+    image = rng.gamma(0.7, 1.0, (*SIZE, 3)) * np.where(rng.random((*SIZE, 1)) < 0.05, 50, 1)
+    image[rng.random((*SIZE, 3)) < 0.02] = np.nan
+    image[rng.random((*SIZE, 3)) < 0.02] = -0.3
+    motion = rng.uniform(-1.5, 1.5, (*SIZE, 2)).round(2)
+    motion[rng.random(SIZE) < 0.05] = [40.0, 0.0]
+    motion[rng.random(SIZE) < 0.05] = np.inf
+    depth = rng.choice([0.0, 2.0, 2.0, 3.0, 5.0, np.nan], SIZE)
+    return image, motion, depth
+
+
+def test_taa():
+    """The second frame of two: a past, clipped to the box around it and blended."""
+    params = to_params(oracle.PAPER | {"taa_alpha": 0.6})
+    first, image = taa_case(0)[0], taa_case(1)
+    color, frames, _ = oracle_taa.taa(np.zeros((*SIZE, 3)), 0, first, *image[1:], 0.6)
+    expected_color, _, expected = oracle_taa.taa(color, frames, *image, 0.6)
+    past = TaaHistory(color, np.float64(frames))
+    got, linear = compiled(antialiasing.taa, past, *image, params=params, strip_rows=4)
+    np.testing.assert_allclose(got.color, expected_color, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(linear, expected, rtol=1e-9, atol=1e-12)
+    assert float(got.frames) == 2

@@ -42,7 +42,7 @@ def filtered(shot: Shot, params: Params, config: Config) -> Iterator[tuple[np.nd
     with closing(read_ahead(shot.read, range(shot.length), threads=1)) as examples:
         for frame, target in examples:
             leaves = Params(*(np.asarray(leaf, frame.depth.dtype) for leaf in params))
-            history, output = run(init(frame) if history is None else history, frame, params=leaves)
+            history, output = run(init(frame, config=config) if history is None else history, frame, params=leaves)
             yield np.asarray(output.image), target
 
 

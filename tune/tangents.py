@@ -80,7 +80,7 @@ def compile_pass(free: tuple[Free, ...], config: Config, terms: tuple[Term, ...]
     """The functions that run one frame at free coordinates `y` `[n]`, residuals in the order of `terms`; compiled once."""
     one = partial(_one_frame, free=free, config=config, terms=terms)
     jit = partial(jax.jit, compiler_options=dict(COMPILER_OPTIONS))
-    return FramePass(start=jit(_start), plain=jit(partial(_plain, one)), linear=jit(partial(_linear, one)))
+    return FramePass(start=jit(partial(_start, config)), plain=jit(partial(_plain, one)), linear=jit(partial(_linear, one)))
 
 
 def no_tangents(carry: Carry, directions: int) -> Smooth:
@@ -88,9 +88,9 @@ def no_tangents(carry: Carry, directions: int) -> Smooth:
     return jax.tree.map(lambda a: jnp.zeros((directions, *a.shape), a.dtype), _smooth(carry))
 
 
-def _start(frame: Frame) -> Carry:
+def _start(config: Config, frame: Frame) -> Carry:
     nothing = jnp.zeros_like(frame.emission)
-    return Carry(init(frame), Seen(nothing, nothing, jnp.zeros_like(frame.depth), nothing))
+    return Carry(init(frame, config=config), Seen(nothing, nothing, jnp.zeros_like(frame.depth), nothing))
 
 
 def _smooth(carry: Carry) -> Smooth:

@@ -34,6 +34,7 @@ def denoise(
     preset: Annotated[str | None, Parameter(metavar="NAME", group=FILTER)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=FILTER)] = None,
     set_: Annotated[tuple[str, ...], Repeated, Parameter(name="--set", metavar="NAME=VALUE", group=FILTER)] = (),
+    taa: Annotated[bool, Flag, Parameter(group=FILTER)] = False,
     device: Annotated[str | None, Parameter(metavar="DEVICE", group=FILTER)] = None,
     float_: Annotated[bool, Flag, Parameter(name="--float", group=OUTPUT)] = False,
     compression: Annotated[Compression, Parameter(group=OUTPUT)] = "zip",
@@ -63,6 +64,7 @@ def denoise(
         preset: A preset by name; `svgf-jax params list` shows them.
         params: Parameters from a TOML file; `svgf-jax params show` prints one.
         set_: One parameter, or one value per a-trous level: sigma_normal=64, sigma_luminance=4,3,2,1,1. Repeatable.
+        taa: Temporal anti-aliasing of the result; the same as --set taa=true.
         device: cpu, gpu, gpu:1, ...; what JAX chooses if not given.
         float_: Write 32-bit float instead of 16-bit.
         compression: EXR compression of the output.
@@ -79,7 +81,7 @@ def denoise(
         json: Print a summary as JSON to the standard output; all else goes to the standard error.
         verbose: Also tell which channel plays which role, the parameters and the device.
     """
-    chosen_preset, chosen, config = settings.choose(preset, params, set_)
+    chosen_preset, chosen, config = settings.choose(preset, params, (*set_, "taa=true") if taa else set_)
     roles = settings.assignments(channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
     files = settings.assignments(file, option="--file", example="normal=normal_####.exr")
 
