@@ -266,7 +266,8 @@ def _plane_distance_squared(p: Guide, q: Guide) -> Array:
     length = _dot(between, between)
     apart = length > _SAME_POINT
     along = _dot(p.normal, between)
-    return jnp.where(apart, along * along / jnp.where(apart, length, 1.0), 0.0)
+    inverse = 1.0 / jnp.where(apart, length, 1.0)  # a quotient's derivative would overflow where the square does not
+    return jnp.where(apart, along * inverse * along, 0.0)
 
 
 def squared_angle(cosine: Array) -> Array:
