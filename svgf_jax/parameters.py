@@ -63,6 +63,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "variance_scale": _NOT_NEGATIVE,
     "clamp_sigma": _NOT_NEGATIVE,
     "taa_alpha": (0.0, 1.0),
+    "outlier_sigma": _NOT_NEGATIVE,
 }
 
 

@@ -169,6 +169,8 @@ class Params(NamedTuple):
         clamp_sigma: standard deviations that the history may lie off this frame's mean, >= 0. Read only where
             `clamp_radius` > 0.
         taa_alpha: least weight of the new frame in temporal anti-aliasing, in [0, 1]. Read only where `taa` is on.
+        outlier_sigma: standard deviations that a pixel may lie off its neighbours' mean, >= 0. Read only where
+            `outlier_radius` > 0.
     """
 
     alpha: Any = 0.2
@@ -192,6 +194,7 @@ class Params(NamedTuple):
     variance_scale: Any = 100.0
     clamp_sigma: Any = 1.0
     taa_alpha: Any = 0.1
+    outlier_sigma: Any = 10.0
 
 
 class Config(NamedTuple):
@@ -212,6 +215,8 @@ class Config(NamedTuple):
         clamp_radius: clamp the history to mean +- clamp_sigma standard deviations of this frame's illumination over
             a window of this radius (3 = 7 x 7); 0 = do not.
         taa: temporal anti-aliasing of the image, after everything else.
+        outlier_radius: clamp this frame's illumination to mean +- outlier_sigma standard deviations of the neighbours in
+            a window of this radius (3 = 7 x 7) before anything reads it; 0 = do not.
     """
 
     levels: int = 5
@@ -224,6 +229,7 @@ class Config(NamedTuple):
     warm_up: bool = True
     clamp_radius: int = 0
     taa: bool = False
+    outlier_radius: int = 0
 
 
 CHOICES: dict[str, range | tuple] = {
@@ -237,6 +243,7 @@ CHOICES: dict[str, range | tuple] = {
     "warm_up": (True, False),
     "clamp_radius": range(13),
     "taa": (False, True),
+    "outlier_radius": range(13),
 }
 """What each field of `Config` may be."""
 
@@ -248,6 +255,7 @@ _READ_WHERE: dict[str, tuple[str, Any]] = {
     "variance_scale": ("variance", ("temporal",)),
     "clamp_sigma": ("clamp_radius", range(1, 13)),
     "taa_alpha": ("taa", (True,)),
+    "outlier_sigma": ("outlier_radius", range(1, 13)),
 }
 """Parameters that are read only where a choice has one of some values."""
 

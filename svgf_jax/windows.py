@@ -9,7 +9,13 @@ from svgf_jax.sampling import STRIP_ROWS, Planes, square_offsets, sum_over_taps
 
 
 def window_range(
-    image: Planes, counts: Array, *, radius: int, sigma: Array | float, strip_rows: int | None = STRIP_ROWS
+    image: Planes,
+    counts: Array,
+    *,
+    radius: int,
+    sigma: Array | float,
+    centre: bool = True,
+    strip_rows: int | None = STRIP_ROWS,
 ) -> tuple[Planes, Planes]:
     """mean - sigma * deviation and mean + sigma * deviation of each plane over (2 radius + 1)^2 pixels.
 
@@ -18,6 +24,7 @@ def window_range(
         counts: `[H, W]` bool, the pixels that count. Where the pixel itself does not, the range means nothing.
         radius: of the window, in pixels.
         sigma: in standard deviations (population), >= 0; traced.
+        centre: whether the pixel itself counts too. If not, and no other does, both ends are its own value.
         strip_rows: how `sampling.sum_over_taps` blocks the work; None = the plain form.
 
     Returns:
@@ -35,7 +42,7 @@ def window_range(
 
     def finish(sums, p):
         weight, totals = sums
-        divisor = jnp.maximum(weight, 1.0)
+        divisor = jnp.maximum(weight if centre else weight - 1.0, 1.0)  # the centre's difference is 0 in every sum
 
         def ends(total, own):
             mean = total[0] / divisor

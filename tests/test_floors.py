@@ -23,7 +23,7 @@ FLOORS = [
         "sequences",
         "cameras",
     },
-    {"variance", "atrous", "adaptation", "roles", "preview", "joint_bilateral"},
+    {"variance", "atrous", "adaptation", "roles", "preview", "joint_bilateral", "outliers"},
     {"frames", "references", "pipeline", "checkpoint"},
     {"compiled", "comparison", "outputs", "plan"},
     {"streaming"},
@@ -41,6 +41,7 @@ STAGES = {
     "atrous",
     "joint_bilateral",
     "antialiasing",
+    "outliers",
 }
 NUMPY_ONLY = {
     "atomic",

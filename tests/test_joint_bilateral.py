@@ -5,7 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import oracle_bilateral as oracle
+import oracle_classic as oracle
 import pytest
 from bridge import QUICK
 from hypothesis import given, settings
@@ -74,19 +74,17 @@ def test_filters_are_their_formulas(name, footprint):
     assert np.abs(got - s["image"]).max() > 0.3
 
 
-@pytest.mark.parametrize(("size", "channels"), [((1, 1), 1), ((1, 7), 2), ((5, 1), 4)])
+@pytest.mark.parametrize(("size", "channels"), [((1, 1), 1), ((5, 1), 4)])
 def test_images_smaller_than_the_window(size, channels):
     s = scene(*size, channels)
     np.testing.assert_allclose(run("joint", s, radius=6), by_loops("joint", s, radius=6), rtol=1e-11, atol=1e-11)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_a_zero_sum_of_weights_gives_the_input_pixel(dtype):
+def test_a_zero_sum_of_weights_gives_the_input_pixel():
     """Without a normal the clamped dot product is 0, a right angle, even of a pixel with itself: exp(-123) at 0.1 radians."""
     s = scene(6, 7)
     s["normal"] = np.where((np.arange(7) < 3)[None, :, None], 0.0, s["normal"])
-    s["image"] = s["image"].astype(dtype)
-    got = run("joint", s, radius=3, dtype=dtype, sigmas={"sigma_normal": 0.1})
+    got = run("joint", s, radius=3, sigmas={"sigma_normal": 0.1})
     np.testing.assert_array_equal(got[:, :3], s["image"][:, :3])
 
 
@@ -150,7 +148,7 @@ def test_claims(footprint, seed, sigma, power):
 
 
 WEIGHTS = np.random.default_rng(3).normal(size=(6, 9, 1))
-PARTS = {"joint": "full", "bilateral": "atrous"}
+PARTS = {"joint": "full", "gaussian": "atrous"}
 
 
 def compiled_slopes(name, mask):

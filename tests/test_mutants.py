@@ -13,13 +13,17 @@ from types import ModuleType
 from typing import NamedTuple
 
 import pytest
+import test_joint_bilateral
+import test_outliers
 import test_stages_oracle
 
 import svgf_jax
 
+TESTS = (test_stages_oracle, test_outliers, test_joint_bilateral)
+
 
 class Mutant(NamedTuple):
-    """`changes` of text in the module, and the test of `test_stages_oracle` (with its arguments) that fails."""
+    """`changes` of text in the module, and the test of one of `TESTS` (with its arguments) that fails."""
 
     module: str
     changes: tuple[tuple[str, str], ...]
@@ -291,6 +295,32 @@ MUTANTS = {
     "bright pixels not weighed down": mutant(
         "tonemapping", "scale = 1.0 + _luma(color)", "scale = 1.0 + 0.0 * _luma(color)", "test_taa"
     ),
+    # Classic filters
+    "normal distance not squared": mutant(
+        "joint_bilateral", "return jnp.where(opposite, angle * angle, square)",
+        "return jnp.where(opposite, angle, jnp.sqrt(square))", "test_filters_are_their_formulas", "joint", "full",
+    ),
+    "plane of the tap instead of the pixel": mutant(
+        "joint_bilateral", "along = _dot(p.normal, between)", "along = _dot(q.normal, between)",
+        "test_filters_are_their_formulas", "joint", "full",
+    ),
+    "sigma^2 for 2 sigma^2": mutant(
+        "joint_bilateral", "return 0.5 * inverse * inverse", "return inverse * inverse",
+        "test_filters_are_their_formulas", "gaussian", "full",
+    ),
+    "masked pixels count": mutant(
+        "joint_bilateral", "counts=counts.astype(dtype) if guided else jnp.ones_like(counts, dtype)",
+        "counts=jnp.ones_like(counts, dtype)", "test_filters_are_their_formulas", "bilateral", "separable",
+    ),
+    "steps that do not grow": mutant(
+        "joint_bilateral", "[2**level for level in range(levels)]", "[1 for level in range(levels)]",
+        "test_filters_are_their_formulas", "bilateral", "atrous",
+    ),
+    "the pixel itself among its neighbours": mutant("outliers", "centre=False", "centre=True", "test_remove_outliers", 3, 3.0),
+    "outliers of the background count": mutant(
+        "windows", "one = counts.astype(jax.tree.leaves(image)[0].dtype)",
+        "one = jnp.ones_like(counts, jax.tree.leaves(image)[0].dtype)", "test_remove_outliers", 3, 3.0,
+    ),
     # Sanitising and the whole
     "infinite radiance kept": mutant(
         "sanitation", "radiance_finite & radiance_positive, frame", "~jnp.isnan(frame.radiance) & radiance_positive, frame",
@@ -316,7 +346,7 @@ MUTANTS = {
 
 
 def stages(module="pipeline", found=()) -> tuple[str, ...]:
-    """The modules that `pipeline` stands on, itself included; types apart, which must stay the same types."""
+    """The modules that a module stands on, itself included; types apart, which must stay the same types."""
     if module == "types" or module in found:
         return found
     found = (*found, module)
@@ -331,7 +361,8 @@ def source(module: str) -> str:
 
 def mutated(change: Mutant) -> dict[str, ModuleType]:
     """The stages' modules, imported anew, one of them changed; what was loaded before stays what it is."""
-    names = [f"svgf_jax.{stage}" for stage in stages()]
+    modules = stages("joint_bilateral", stages())
+    names = [f"svgf_jax.{stage}" for stage in modules]
     kept = {name: sys.modules.pop(name) for name in names if name in sys.modules}
     try:
         text = source(change.module)
@@ -341,7 +372,7 @@ def mutated(change: Mutant) -> dict[str, ModuleType]:
         module = ModuleType(f"svgf_jax.{change.module}")
         sys.modules[module.__name__] = module
         exec(compile(text, f"{change.module}.py with a bug", "exec"), module.__dict__)
-        return {stage: importlib.import_module(f"svgf_jax.{stage}") for stage in stages()}
+        return {stage: importlib.import_module(f"svgf_jax.{stage}") for stage in modules}
     finally:
         for name in names:
             sys.modules.pop(name, None)
@@ -350,14 +381,20 @@ def mutated(change: Mutant) -> dict[str, ModuleType]:
             setattr(svgf_jax, name.removeprefix("svgf_jax."), module)
 
 
+def put_in_place(monkeypatch, change: Mutant) -> None:
+    for stage, module in mutated(change).items():
+        for tests in TESTS:
+            if hasattr(tests, stage):
+                monkeypatch.setattr(tests, stage, module)
+
+
 @pytest.mark.parametrize("name", MUTANTS)
 def test_mutant_is_caught(monkeypatch, name):
     change = MUTANTS[name]
-    for stage, module in mutated(change).items():
-        if hasattr(test_stages_oracle, stage):
-            monkeypatch.setattr(test_stages_oracle, stage, module)
+    put_in_place(monkeypatch, change)
+    (test,) = (getattr(tests, change.caught_by) for tests in TESTS if hasattr(tests, change.caught_by))
     with pytest.raises(AssertionError):
-        getattr(test_stages_oracle, change.caught_by)(*change.arguments)
+        test(*change.arguments)
 
 
 def test_the_modules_are_in_place_again():
@@ -368,7 +405,5 @@ def test_the_modules_are_in_place_again():
 
 
 def test_an_unchanged_module_passes(monkeypatch):
-    for stage, module in mutated(Mutant("atrous", (), "")).items():
-        if hasattr(test_stages_oracle, stage):
-            monkeypatch.setattr(test_stages_oracle, stage, module)
+    put_in_place(monkeypatch, Mutant("atrous", (), ""))
     test_stages_oracle.test_atrous_level(0)

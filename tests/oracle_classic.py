@@ -1,4 +1,5 @@
-"""Classic filters in plain NumPy loops, from their formulas: the window kernel of GAMES202's homework 5 and its approximations.
+"""Classic filters in plain NumPy loops, from their formulas: the window kernel of GAMES202's homework 5, its approximations, and
+the removal of outliers.
 
 `full` sums over the window. `separable` and `atrous` sum over ever more of it, pass by pass: numerators and denominators are handed
 on, and divided at the end.
@@ -85,22 +86,16 @@ def joint_bilateral(image, guides, sigmas, radius, footprint="full", levels=None
     return np.where(counted[..., None], above / np.where(counted, below, 1.0)[..., None], image)
 
 
-def remove_outliers(signal, surface, radius, sigma, centre=True):
-    """Values clamped to mean +- sigma standard deviations of the window's pixels with a surface; the others are left alone."""
-    height, width, channels = signal.shape
+def remove_outliers(signal, surface, radius, sigma):
+    """`signal` [H, W, C] clamped to mean +- sigma population standard deviations of the others around with a surface."""
+    height, width, _ = signal.shape
     result = np.array(signal)
     for y in range(height):
         for x in range(width):
             rows = range(max(0, y - radius), min(height, y + radius + 1))
             columns = range(max(0, x - radius), min(width, x + radius + 1))
-            window = [
-                signal[q] for q in ((i, j) for i in rows for j in columns) if surface[q] and (centre or q != (y, x))
-            ]
-            if not surface[y, x] or not window:
-                continue
-            mean = sum(window) / len(window)
-            deviation = np.sqrt(sum((value - mean) ** 2 for value in window) / len(window))
-            for c in range(channels):
-                low, high = mean[c] - sigma * deviation[c], mean[c] + sigma * deviation[c]
-                result[y, x, c] = min(high, max(low, signal[y, x, c]))
+            others = [signal[i, j] for i in rows for j in columns if surface[i, j] and (i, j) != (y, x)]
+            if surface[y, x] and others:
+                mean, reach = np.mean(others, axis=0), sigma * np.std(others, axis=0)
+                result[y, x] = np.clip(signal[y, x], mean - reach, mean + reach)
     return result
