@@ -1,4 +1,4 @@
-"""Pictures to look at: tone-mapped 8-bit images, labelled side by side, as PNG or MP4. No JAX."""
+"""Pictures to look at: tone-mapped 8-bit images, labelled, side by side or split, as PNG, MP4, GIF or WebP. No JAX."""
 
 import importlib
 import shutil
@@ -49,6 +49,66 @@ def side_by_side(panels: Sequence[tuple[str, np.ndarray]]) -> np.ndarray:
         draw.text(middle, label, fill=(235, 235, 235), font=ImageFont.load_default(size), anchor="mm")
         left += picture.shape[1] + gap
     return np.asarray(canvas)
+
+
+def split_screen(panels: Sequence[tuple[str, np.ndarray]], *, position: float | None = None) -> np.ndarray:
+    """8-bit `[H, W, 3]` pictures of one size as stripes of one picture, from left to right, each with its label in it.
+
+    `position` in [0, 1] is where the line between two pictures is, as a part of the width; None divides the width equally.
+    A label that its stripe has no room for is left out. Returns `[H, W, 3]` uint8.
+    """
+    if len({picture.shape for _, picture in panels}) != 1 or (position is not None and len(panels) != 2):
+        shapes = [picture.shape for _, picture in panels]
+        raise SvgfError(
+            f"Cannot split a screen between pictures of shapes {shapes}{'' if position is None else f' at {position}'}: "
+            "wanted pictures of one size, and two of them where the line has a place of its own."
+        )
+    height, width = panels[0][1].shape[:2]
+    cuts = [position] if position is not None else [i / len(panels) for i in range(1, len(panels))]
+    edges = [0, *(min(max(round(cut * width), 0), width) for cut in cuts), width]
+    size = max(11, height // 20)
+    font = ImageFont.load_default(size)
+    canvas = Image.new("RGB", (width, height))
+    draw = ImageDraw.Draw(canvas)
+    for (label, picture), left, right in zip(panels, edges, edges[1:], strict=False):
+        canvas.paste(Image.fromarray(np.ascontiguousarray(picture[:, left:right])), (left, 0))
+        wide = draw.textlength(label, font=font) + size
+        if label and wide <= right - left:
+            middle = (left + right) / 2
+            draw.rectangle((middle - wide / 2, size * 0.4, middle + wide / 2, size * 2.0), fill=(24, 24, 24))
+            draw.text((middle, size * 1.2), label, fill=(235, 235, 235), font=font, anchor="mm")
+    for edge in edges[1:-1]:
+        draw.line((edge, 0, edge, height), fill=(235, 235, 235), width=max(1, height // 270))
+    return np.asarray(canvas)
+
+
+def write_animation(path: str | Path, pictures: Iterable[np.ndarray], *, fps: float = 24.0) -> float:
+    """Write `[H, W, 3]` uint8 pictures of one size as an endless GIF (256 colours a picture) or WebP, by the name's suffix.
+
+    GIF knows hundredths of a second and WebP thousandths: the frame rate is the nearest of these, and returned. Equal pictures
+    in a row become one that lasts longer. Written under a temporary name and then renamed; `SvgfError` where that fails.
+    """
+    kind = Path(path).suffix.lower()
+    tick = {".gif": 10, ".webp": 1}[kind]  # milliseconds
+    duration = max(round(1000 / float(frame_rate(fps)) / tick), 1) * tick
+
+    def images() -> Iterable[Image.Image]:
+        for picture in pictures:
+            image = Image.fromarray(np.ascontiguousarray(picture))
+            yield image.quantize(256, method=Image.Quantize.MEDIANCUT) if kind == ".gif" else image
+
+    def save(temporary: str) -> None:
+        frames = iter(images())
+        first = next(frames, None)
+        if first is None:
+            raise SvgfError(f"There is no picture to put into the video {path}: wanted at least one frame.")
+        options = {} if kind == ".gif" else {"quality": 90, "method": 4}
+        first.save(
+            temporary, format=kind[1:], save_all=True, append_images=frames, duration=duration, loop=0, **options
+        )
+
+    _write_atomically(path, save)
+    return 1000 / duration
 
 
 def write_png(path: str | Path, picture: np.ndarray) -> None:

@@ -25,7 +25,7 @@ FLOORS = [
     },
     {"variance", "atrous", "adaptation", "roles", "preview", "joint_bilateral", "outliers"},
     {"frames", "references", "pipeline", "checkpoint"},
-    {"compiled", "comparison", "outputs", "plan"},
+    {"compiled", "comparison", "film", "outputs", "plan"},
     {"streaming"},
     {"demo"},
     {"commands"},
