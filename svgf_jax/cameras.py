@@ -25,6 +25,10 @@ BEHIND = -1e4
 """Previous pixel coordinate given to points that were behind the previous camera: far outside any image."""
 
 
+APART = 0.1
+"""Pixels by which a camera may show a position beside its pixel's centre without being told of."""
+
+
 class Camera(NamedTuple):
     """One frame's camera and objects; matrices `[4, 4]` float64, objects by id."""
 
@@ -35,11 +39,19 @@ class Camera(NamedTuple):
 
 
 class Cameras(NamedTuple):
-    """A sequence's cameras by frame number; `size` is (width, height) of the picture, if the file says it."""
+    """A sequence's cameras by frame number.
+
+    Attributes:
+        path: the file, or the pattern of the files.
+        frames: camera by frame number.
+        size: (width, height) of the picture, if the file says it.
+        files: frame number and file of each frame, where each has its own; None where it is missing.
+    """
 
     path: str
     frames: dict[int, Camera]
     size: tuple[int, int] | None
+    files: tuple[tuple[int, str | None], ...] = ()
 
 
 def load_cameras(path: PathName) -> Cameras:
@@ -170,6 +182,35 @@ def position_residual(camera: Camera, position: np.ndarray, *, origin: tuple[int
     with np.errstate(all="ignore"):
         apart = screen[..., :2] / screen[..., 3:] - pixel_centres(position.shape[:2], origin)
         return np.hypot(apart[..., 0], apart[..., 1])
+
+
+def mismatch(
+    camera: Camera,
+    position: np.ndarray,
+    depth: np.ndarray | None,
+    where: np.ndarray,
+    *,
+    origin: tuple[int, int] = (0, 0),
+) -> str | None:
+    """What is wrong if positions `[H, W, 3]`, depths `[H, W]` and camera are not of one scene, in words; None if they are.
+
+    Judged by the pixels `where` `[H, W]`, of which 1 % may be odd.
+    """
+    if not where.any():
+        return None
+    if (position_residual(camera, position, origin=origin)[where] > APART).mean() > 0.01:
+        return (
+            f"positions are shown more than {APART} pixels beside the centres of their pixels: motion and previous depths will be "
+            "wrong. Wanted cameras of the same frames, pixels counted from the top left, and no jitter but that of the positions."
+        )
+    forward = camera.world_to_camera[2]
+    z = position[where].astype(np.float64) @ forward[:3] + forward[3]
+    if depth is not None and (np.abs(z - depth[where]) > 0.01 * np.abs(z)).mean() > 0.01:
+        return (
+            "depth is not the camera's z of the positions: history will be rejected. Wanted the distance along the viewing axis, "
+            "positive in front of the camera."
+        )
+    return None
 
 
 def _pixel_centres(shape: tuple[int, ...], origin: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

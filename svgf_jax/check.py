@@ -21,6 +21,8 @@ def check_frame(frame: Frame) -> None:
         "motion": (height, width, 2),
         "object_id": (height, width),
     }
+    if frame.position is not None:
+        shapes["position"] = (height, width, 3)
     for name, wanted in shapes.items():
         got = tuple(getattr(frame, name).shape)
         if got != wanted:
@@ -37,9 +39,9 @@ def check_frame(frame: Frame) -> None:
         raise SvgfError(
             f"variance has shape {tuple(frame.variance.shape)}; wanted {(signals, height, width)}, one plane a signal"
         )
-    for name in Frame._fields if frame.variance is not None else Frame._fields[:-1]:
+    for name, array in frame._asdict().items():
         wanted_dtype = jnp.int32 if name == "object_id" else dtype
-        if getattr(frame, name).dtype != wanted_dtype:
+        if array is not None and array.dtype != wanted_dtype:
             raise SvgfError(
                 f"{name} is {getattr(frame, name).dtype}; wanted {jnp.dtype(wanted_dtype)}, like the rest of the frame"
             )

@@ -28,7 +28,7 @@ def compare_sequences(
     `ref` for `reference`. Raises SvgfError: not found, no frame in common, unreadable, of different sizes, no colour.
     """
     sequences = (
-        find_sequence(out, frames=frames, missing="reset", prefer=("frame", "denoised")),
+        find_sequence(out, frames=frames, missing="reset", prefer=("frame", "denoised", "beauty")),
         find_sequence(reference, frames=frames, missing="reset", prefer=NAMES),
     )
     ours, theirs = ({number: path for number, path in sequence.files if path is not None} for sequence in sequences)

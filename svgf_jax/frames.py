@@ -6,6 +6,7 @@ what is not finite in it the filter repairs and counts.
 """
 
 import os
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -13,12 +14,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from svgf_jax import exr
-from svgf_jax.cameras import Cameras, find_camera, load_cameras, previous_depth, reproject
+from svgf_jax.cameras import (
+    Cameras,
+    find_camera,
+    load_cameras,
+    mismatch,
+    position_from_depth,
+    previous_depth,
+    reproject,
+)
 from svgf_jax.exr_layout import PathName, Window
+from svgf_jax.matrices import load_matrices
 from svgf_jax.roles import Roles, canonical_role, check_channels, resolve_roles
-from svgf_jax.sequences import Missing, Sequence, companion, find_sequence
+from svgf_jax.sequences import Missing, Sequence, beside, companion, find_sequence
 from svgf_jax.types import Frame, SvgfError
 
+_BESIDE = ("emission", "albedo", "normal", "depth", "motion", "id", "position")
 FAR = 1e8
 """Depths from here on are the renderers' way of saying that nothing was hit."""
 
@@ -35,6 +46,7 @@ class Source(NamedTuple):
         data_window, display_window: of the first frame; every frame must have the same.
         warnings: what the user should know before the work starts, as sentences.
         max_pixels: largest picture that will be read.
+        position: whether frames get their `Frame.position`.
     """
 
     sequence: Sequence
@@ -46,6 +58,7 @@ class Source(NamedTuple):
     display_window: Window
     warnings: tuple[str, ...]
     max_pixels: int
+    position: bool = False
 
 
 class LoadedFrame(NamedTuple):
@@ -76,6 +89,7 @@ def open_source(
     channel: Mapping[str, Iterable[str]] | None = None,
     file: Mapping[str, PathName] | None = None,
     cameras: PathName | None = "auto",
+    position: bool = False,
     max_pixels: int = exr.MAX_PIXELS,
 ) -> Source:
     """Find the files of a sequence and settle the roles by the first frame's header; no pixel is read.
@@ -86,7 +100,10 @@ def open_source(
         missing: what to do about missing frames: "error", "hold" or "reset".
         channel: role -> channel names, where they are not the native ones (see `svgf_jax.roles`).
         file: role -> pattern of files that hold this role.
-        cameras: a cameras.json; "auto" takes the one beside the frames if there is one, None none.
+        cameras: a cameras.json, or GAMES202's `matrix_#.mat`; "auto" takes those beside the frames if there are any,
+            None none.
+        position: also give each frame its world positions, which the joint bilateral filter reads: the renderer's, or from
+            depth and cameras.
         max_pixels: refuse larger pictures.
 
     Raises SvgfError: whatever is missing or unclear, naming the file.
@@ -96,10 +113,23 @@ def open_source(
     header = exr.read_header(path)
     files = {canonical_role(role): companion(sequence, where) for role, where in (file or {}).items()}
     own = {role: (str(other.files[at][1]), exr.read_header(str(other.files[at][1]))) for role, other in files.items()}
-    names = {role: (name, tuple(other.channels)) for role, (name, other) in own.items()}
-    roles = resolve_roles(tuple(header.channels), channel=channel, files=names, where=path)
+
+    def settle(found: Iterable[str] = ()) -> Roles:
+        names = {role: (name, tuple(other.channels)) for role, (name, other) in own.items()}
+        return resolve_roles(tuple(header.channels), channel=channel, files=names, beside=tuple(found), where=path)
+
+    roles = settle()
+    if near := {role: where for role in _BESIDE if role not in roles.layers and (where := _beside(sequence, role))}:
+        files |= {role: companion(sequence, where) for role, where in near.items()}
+        own |= {role: (str(files[role].files[at][1]), exr.read_header(str(files[role].files[at][1]))) for role in near}
+        roles = settle(near)
     files = {role: other for role, other in files.items() if role in roles.layers}
     found = _find_cameras(cameras, sequence, header, path)
+    if position and not ("position" in roles.layers or (found and "depth" in roles.layers)):
+        raise SvgfError(
+            f"{path}: no positions, and no depth with cameras to take them from. Wanted position.X, .Y, .Z "
+            "(--file position=..., --channel position=...), or depth and a cameras.json."
+        )
     if found and roles.layers.keys() & {"depth", "position"} and "motion" not in roles.layers:
         roles = roles._replace(absent=roles.absent | {"motion": f"{found.path} says"})
     half = set()
@@ -107,9 +137,18 @@ def open_source(
         types = own[role][1].channels if layer.own_file else header.channels
         if np.dtype(np.float16) in {types[name] for name in layer.channels}:
             half.add(role)
-    warnings = tuple(_warnings(roles, half, found))
+    told = tuple(_warnings(roles, half, found))
     return Source(
-        sequence, roles, files, frozenset(half), found, header.data_window, header.display_window, warnings, max_pixels
+        sequence,
+        roles,
+        files,
+        frozenset(half),
+        found,
+        header.data_window,
+        header.display_window,
+        told,
+        max_pixels,
+        position,
     )
 
 
@@ -135,6 +174,7 @@ def read_frame(source: Source, index: int) -> LoadedFrame:
         radiance, emission = _light(source.roles.signals, planes, counts)
         object_id, normal, depth = _guides(planes, radiance.shape[1:3], counts)
         motion, prev_depth = _past(source, index, planes, depth, object_id, notes)
+        position = _position(source, number, planes, depth, object_id, notes)
         if "id" in source.half and (largest := np.fmax.reduce(planes["id"], axis=None)) > 2048:
             notes.append(
                 f"object ids up to {largest:.0f} in half float: above 2048 neighbouring ids become one. "
@@ -144,17 +184,30 @@ def read_frame(source: Source, index: int) -> LoadedFrame:
     measured = [planes[f"{role}_variance"][..., 0] for role in source.roles.signals if f"{role}_variance" in planes]
     variance = np.stack(measured) if measured else None
     arrays: list[Any] = [radiance, albedo[None], emission, normal, depth, prev_depth, motion, object_id, variance]
+    arrays.append(position if source.position else None)
     counts = {reason: count for reason, count in counts.items() if count}
     return LoadedFrame(Frame(*arrays), number, path, images[path], counts, tuple(notes))
 
 
 def load_sequence(pattern: PathName, **options: Any) -> Frame:
-    """All frames of a sequence stacked along a leading T, ready for `svgf_jax.denoise`. Options: see `open_source`."""
+    """All frames of a sequence stacked along a leading T, ready for `svgf_jax.denoise`. Options: see `open_source`.
+
+    What is odd about them is warned of (UserWarning), each thing once.
+    """
     source = open_source(pattern, **options)
     with ThreadPoolExecutor(4) as pool:
-        frames = list(pool.map(lambda index: read_frame(source, index).frame, range(len(source.sequence.files))))
+        items = list(pool.map(lambda index: read_frame(source, index), range(len(source.sequence.files))))
+    for note in dict.fromkeys(note for item in items for note in item.notes):
+        warnings.warn(note, stacklevel=2)
+    frames = [item.frame for item in items]
     stacked: list[Any] = [None if planes[0] is None else np.stack(planes) for planes in zip(*frames, strict=True)]
     return Frame(*stacked)
+
+
+def _beside(sequence: Sequence, role: str) -> str | None:
+    """The pattern of the files beside the frames that are called after a role: normal_#.exr, ID_#.exr."""
+    found = (beside(sequence, name) for name in (role, role.capitalize(), role.upper()))
+    return next((where for where in found if where), None)
 
 
 def _light(
@@ -216,9 +269,8 @@ def _past(
     prev_depth = depth
     skipped = before is not None and before != number - 1
     if before is not None and source.cameras and planes.keys() & {"depth", "position"}:
-        (left, top, *_), (screen_left, screen_top, *_) = source.data_window, source.display_window
         where: Any = {"number": number, "previous": before, "position": planes.get("position")}
-        where["origin"] = (left - screen_left, top - screen_top)
+        where["origin"] = _origin(source)
         if skipped or "motion" not in planes:
             prev_depth, motion = reproject(source.cameras, depth, object_id, **where)
         else:
@@ -230,6 +282,36 @@ def _past(
         )
     sky = (object_id == -1)[..., None]
     return np.where(sky & ~np.isfinite(motion), 0, motion).astype(np.float32), prev_depth
+
+
+def _position(
+    source: Source,
+    number: int,
+    planes: dict[str, np.ndarray],
+    depth: np.ndarray,
+    object_id: np.ndarray,
+    notes: list[str],
+) -> np.ndarray | None:
+    """World positions `[H, W, 3]`, if they are wanted or there; with cameras it is checked that they belong to them."""
+    surface = object_id != -1
+    position = planes.get("position")
+    if source.cameras is None:
+        return position
+    camera = find_camera(source.cameras, number)
+    if position is not None:
+        known = depth if "depth" in planes else None
+        seen = surface & np.isfinite(position).all(-1)
+        if text := mismatch(camera, position, known, seen, origin=_origin(source)):
+            notes.append(f"{source.cameras.path}: {text}")
+    elif source.position:
+        position = position_from_depth(camera, np.where(surface, depth, 1.0), origin=_origin(source)).astype(np.float32)
+    return position
+
+
+def _origin(source: Source) -> tuple[int, int]:
+    """The first pixel's place on the screen."""
+    (left, top, *_), (screen_left, screen_top, *_) = source.data_window, source.display_window
+    return left - screen_left, top - screen_top
 
 
 def _read(path: str, source: Source) -> exr.Image:
@@ -254,9 +336,11 @@ def _find_cameras(wanted: PathName | None, sequence: Sequence, header: exr.Heade
         return None
     path = os.path.join(os.path.dirname(first), "cameras.json") if wanted == "auto" else os.fspath(wanted)
     if wanted == "auto" and not os.path.isfile(path):
-        return None
+        path = beside(sequence, "matrix", extension=".mat")
+        if path is None:
+            return None
     try:
-        cameras = load_cameras(path)
+        cameras = load_matrices(companion(sequence, path)) if path.endswith(".mat") else load_cameras(path)
         for number, file in sequence.files:
             if file is not None:
                 find_camera(cameras, number)

@@ -20,10 +20,12 @@ Native names, as they are looked for in each frame's file:
 A variance is that of the mean of a pixel's samples (the samples' own divided by their number), of its luminance. It is used
 where every signal has one.
 
-Any role can be given by hand: other channels (`channel`), another file (`file`), or both.
+Any role can be given by hand: other channels (`channel`), another file (`file`), or both. What is in neither is looked for in
+files of the same name beside `beauty_####.exr` (or color_): `normal_####.exr`, `depth_####.exr`, `ID_####.exr`, ...
 """
 
 import difflib
+import os
 from collections.abc import Collection, Iterable, Mapping
 from typing import NamedTuple
 
@@ -101,6 +103,7 @@ def resolve_roles(
     *,
     channel: Mapping[str, Iterable[str]] | None = None,
     files: Mapping[str, tuple[str, Collection[str]]] | None = None,
+    beside: Collection[str] = (),
     where: str = "the file",
 ) -> Roles:
     """Find the roles among the channel names of a frame's file.
@@ -109,6 +112,7 @@ def resolve_roles(
         channels: names in the frame's file.
         channel: role -> channel names, given by hand; one name may stand for all three of a colour.
         files: role -> (file name, its channel names) for roles with a file of their own.
+        beside: those of `files` that were found beside the frames rather than given by hand.
         where: the frame's file, for messages.
 
     Raises SvgfError: no radiance, an unknown role, a channel that is not there (the closest names are listed), a role
@@ -120,7 +124,8 @@ def resolve_roles(
     for role in WIDTH:
         if role in by_hand or role in own:
             file, names = own.get(role, (where, channels))
-            layers[role] = _given(role, by_hand.get(role), names, file, own_file=role in own)
+            layer = _given(role, by_hand.get(role), names, file, own_file=role in own)
+            layers[role] = layer._replace(reason=f"in {os.path.basename(file)}") if role in beside else layer
         elif layer := _native(role, channels, where):
             layers[role] = layer
     asked = by_hand.keys() | own.keys()

@@ -13,8 +13,8 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
     """Make every number of a frame finite.
 
     Radiance: non-finite or negative components become 0. Emission: non-finite ones become 0, negative ones stay. A non-finite
-    normal, depth or albedo: no surface. A non-finite motion or prev_depth: no history. Guides read 0 where there is no surface,
-    the albedo 1. A measured variance that is not finite or negative becomes -1, unknown.
+    normal, depth, albedo or position: no surface. A non-finite motion or prev_depth: no history. Guides read 0 where there is no
+    surface, the albedo 1. A measured variance that is not finite or negative becomes -1, unknown.
 
     Args:
         frame: one frame; shapes as in `Frame`.
@@ -30,6 +30,8 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
         & jnp.isfinite(frame.depth)
         & jnp.isfinite(frame.albedo).all(axis=(0, 3))
     )
+    if frame.position is not None:
+        guided &= jnp.isfinite(frame.position).all(axis=-1)
     traced = jnp.isfinite(frame.motion).all(axis=-1) & jnp.isfinite(frame.prev_depth)
     surface = was_surface & guided
 
@@ -43,6 +45,7 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
         motion=jnp.where((surface & traced)[..., None], frame.motion, _NOWHERE),
         object_id=jnp.where(surface, frame.object_id, -1),
         variance=None if frame.variance is None else _known_variance(frame.variance),
+        position=None if frame.position is None else jnp.where(surface[..., None], frame.position, 0.0),
     )
     rejected = Rejected(
         radiance=_count(~radiance_finite.all(axis=(0, 3))),

@@ -41,20 +41,26 @@ class Sequence(NamedTuple):
 
 
 def find_sequence(
-    pattern: PathName, *, frames: str | None = None, missing: Missing = "error", prefer: tuple[str, ...] = ("frame",)
+    pattern: PathName,
+    *,
+    frames: str | None = None,
+    missing: Missing = "error",
+    prefer: tuple[str, ...] = ("frame", "beauty"),
 ) -> Sequence:
     """The sequence that a pattern, a folder or a single file stands for.
 
     In a folder that holds several sequences the first that is called as in `prefer` is taken (`frame_0001.exr` is
-    called frame). Without `frames` every frame between the first and the last on the disk is wanted. Raises
-    SvgfError: nothing there, an unclear folder, a range that cannot be read, missing frames under "error".
+    called frame); a folder without EXR files stands for the folder `input` in it. Without `frames` every frame between
+    the first and the last on the disk is wanted. Raises SvgfError: nothing there, an unclear folder, a range that
+    cannot be read, missing frames under "error".
     """
     if missing not in get_args(Missing):
         raise SvgfError(f"missing={missing!r} is not known; choose one of {', '.join(get_args(Missing))}.")
     text = os.fspath(pattern)
     wanted = None if frames is None else parse_range(frames)
     if os.path.isdir(text):
-        text = _pick(text, prefer)
+        inside = os.path.join(text, "input")
+        text = _pick(text if _patterns(text) or not _patterns(inside) else inside, prefer)
     if os.path.isfile(text):
         number = re.search(r"(\d+)(?!.*\d)", os.path.basename(text))
         if wanted is None or number is None:
@@ -77,6 +83,19 @@ def find_sequence(
     return Sequence(tuple((number, found.get(number)) for number in wanted), text, padding, missing)
 
 
+def beside(sequence: Sequence, name: str, *, extension: str = ".exr") -> str | None:
+    """The pattern of the files called `name` where those of `sequence` are called beauty (or color), if there are any.
+
+    `shot/beauty_####.exr`, `depth` -> `shot/depth_####.exr`, if a file of that pattern is there.
+    """
+    folder, own = os.path.split(sequence.name)
+    called = re.match(r"(?i)(beauty|colou?r)(?![a-z])", own)
+    if called is None:
+        return None
+    other = os.path.join(folder, name + os.path.splitext(own[called.end() :])[0] + extension)
+    return other if os.path.isfile(other) or _match(other)[0] else None
+
+
 def companion(
     sequence: Sequence, pattern: PathName, *, partial: bool = False, prefer: tuple[str, ...] = ("frame",)
 ) -> Sequence:
@@ -86,8 +105,8 @@ def companion(
     sequence has is missing here, unless `partial`.
     """
     text = os.fspath(pattern)
-    beside = os.path.join(os.path.dirname(sequence.name), text)
-    text = next((place for place in (text, beside) if os.path.exists(place) or _match(place)[0]), text)
+    near = os.path.join(os.path.dirname(sequence.name), text)
+    text = next((place for place in (text, near) if os.path.exists(place) or _match(place)[0]), text)
     if os.path.isfile(text):
         return sequence._replace(files=tuple((number, text) for number, _ in sequence.files), name=text, padding=0)
     other = find_sequence(text, missing="hold", prefer=prefer)

@@ -19,7 +19,7 @@ from svgf_jax import __version__, checkpoint, exr, frames, outputs, preview, ton
 from svgf_jax.checkpoint import Checkpoint
 from svgf_jax.compiled import Filters, Pipeline, compile_filters, to_host
 from svgf_jax.outputs import WriteOptions
-from svgf_jax.plan import Plan, begin, make_plan, stamp, written
+from svgf_jax.plan import Files, Plan, begin, make_plan, stamp, written
 from svgf_jax.threads import Submit, read_ahead, write_behind
 from svgf_jax.types import Config, History, Output, Params, SvgfError
 
@@ -128,7 +128,7 @@ def run(
         png=options.png,
         video=video,
         identity=_identity(source, options, provenance) | outputs.numbers(params, config),
-        others=[other.files for other in source.files.values()],
+        others=[other.files for other in source.files.values()] + _camera_files(source),
     )
     statuses: Counter[str] = Counter()
     counts: Counter[str] = Counter()
@@ -225,9 +225,14 @@ def _identity(source: frames.Source, options: WriteOptions, provenance: Mapping[
         "attributes": {name: provenance[name] for name in ("svgf_jax:preset", "svgf_jax:source")},
         "options": options._asdict(),
         "roles": {role: list(layer.channels) for role, layer in source.roles.layers.items()},
-        "cameras": None if source.cameras is None else stamp(source.cameras.path),
+        "cameras": None if source.cameras is None or source.cameras.files else stamp(source.cameras.path),
         "missing": source.sequence.missing,
     }
+
+
+def _camera_files(source: frames.Source) -> list[Files]:
+    """The camera file of each frame, where each has its own."""
+    return [source.cameras.files] if source.cameras and source.cameras.files else []
 
 
 def _read(source: frames.Source, index: int) -> frames.LoadedFrame | None:

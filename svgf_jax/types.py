@@ -19,9 +19,11 @@ Conventions, stated here once:
 | `prev_depth`  | `[H, W]`               | the depth that this surface point had in the previous frame's camera, else `depth`|
 | `motion`      | `[H, W, 2]`            | pixels: previous position = this position + motion (x right, y down)              |
 | `object_id`   | `[H, W]` int32         | any number per object; -1 = no surface (background)                               |
+| `position`    | `[H, W, 3]` or None    | world space; None = not known; only the joint bilateral filter reads it            |
 | `variance`    | `[S, H, W]` or None    | measured variance of the pixel's mean, of the radiance's luminance; < 0 = unknown |
 """
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
@@ -46,6 +48,7 @@ class Frame(NamedTuple):
     motion: Array
     object_id: Array
     variance: Array | None = None
+    position: Array | None = None
 
 
 class TaaHistory(NamedTuple):
@@ -120,7 +123,7 @@ class Output(NamedTuple):
     Attributes:
         image: `[H, W, 3]`, the filtered beauty, scene-linear; anti-aliased where `Config.taa` is on.
         illumination: `[S, H, W, 3]`, the filtered demodulated signals.
-        variance: `[S, H, W]`, luminance variance before the a-trous filter.
+        variance: `[S, H, W]`, luminance variance before the a-trous filter; None from methods that have none.
         variance_filtered: `[S, H, W]`, the same after its last level.
         history_length: `[H, W]`, frames accumulated, this one included; 0 where there is no surface.
         valid: `[H, W]` bool, whether reprojection found history.
@@ -130,8 +133,8 @@ class Output(NamedTuple):
 
     image: Array
     illumination: Array
-    variance: Array
-    variance_filtered: Array
+    variance: Array | None
+    variance_filtered: Array | None
     history_length: Array
     valid: Array
     rejected: Rejected
@@ -265,14 +268,14 @@ def unread(config: Config) -> frozenset[str]:
     return frozenset(name for name, (choice, values) in _READ_WHERE.items() if getattr(config, choice) not in values)
 
 
-def is_choice(name: str, value: Any) -> bool:
+def is_choice(name: str, value: Any, *, choices: Mapping[str, range | tuple] = CHOICES) -> bool:
     """Whether a field of `Config` may have this value: True is not 1."""
-    return any(type(value) is type(one) and value == one for one in CHOICES[name])
+    return any(type(value) is type(one) and value == one for one in choices[name])
 
 
-def choices_of(name: str) -> str:
+def choices_of(name: str, *, choices: Mapping[str, range | tuple] = CHOICES) -> str:
     """The values that a field of `Config` may have, in words."""
-    values = CHOICES[name]
+    values = choices[name]
     if isinstance(values, range):
         return f"a whole number from {values[0]} to {values[-1]}"
     return " or ".join(str(value).lower() for value in values)
