@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from svgf_jax.antialiasing import taa_init as taa_init
     from svgf_jax.atrous import atrous_filter as atrous_filter
     from svgf_jax.atrous import atrous_level as atrous_level
+    from svgf_jax.baselines import baseline_denoise as baseline_denoise
+    from svgf_jax.baselines import baseline_init as baseline_init
+    from svgf_jax.baselines import baseline_step as baseline_step
     from svgf_jax.color import demodulate as demodulate
     from svgf_jax.color import luminance as luminance
     from svgf_jax.color import remodulate as remodulate
@@ -28,6 +31,8 @@ if TYPE_CHECKING:
     from svgf_jax.joint_bilateral import bilateral_filter as bilateral_filter
     from svgf_jax.joint_bilateral import gaussian_filter as gaussian_filter
     from svgf_jax.joint_bilateral import joint_bilateral_filter as joint_bilateral_filter
+    from svgf_jax.methods import MethodConfig as MethodConfig
+    from svgf_jax.methods import method as method
     from svgf_jax.modulation import modulate as modulate
     from svgf_jax.moments import Sums as Sums
     from svgf_jax.moments import Welford as Welford
@@ -70,11 +75,13 @@ _HOME = {
     "accumulation": ["Accumulated", "accumulate", "clamp_history"],
     "antialiasing": ["taa", "taa_init"],
     "atrous": ["atrous_filter", "atrous_level"],
+    "baselines": ["baseline_denoise", "baseline_init", "baseline_step"],
     "color": ["demodulate", "luminance", "remodulate"],
     "demo": ["sample"],
     "edges": ["Guides", "depth_gradient", "edge_weight", "guides_of"],
     "frames": ["load_sequence", "open_source", "read_frame"],
     "joint_bilateral": ["bilateral_filter", "gaussian_filter", "joint_bilateral_filter"],
+    "methods": ["MethodConfig", "method"],
     "modulation": ["modulate"],
     "moments": [
         *("Sums", "Welford", "add_sample", "mean_of", "merge_samples"),

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from svgf_jax.types import Config, Frame, History, Output, Params, SvgfError
+from svgf_jax.methods import MethodConfig
+from svgf_jax.types import Config, Frame, History, Output, SvgfError
 
 Pipeline = tuple[Callable[..., History], Callable[..., tuple[History, Output]]]  # init, step
 
@@ -19,20 +20,25 @@ class Filters(NamedTuple):
     device: str
 
 
-def compile_filters(params: Params, config: Config, *, device: str | None, pipeline: Pipeline | None) -> Filters:
+def compile_filters(
+    params: Any, config: Config | MethodConfig, *, device: str | None, pipeline: Pipeline | None
+) -> Filters:
     """The jitted filter with its parameters on the device.
 
-    `device` is "cpu", "gpu:1", ..., None = JAX's default; `pipeline` is `(init, step)`, None = `svgf_jax.pipeline`'s.
+    `device` is "cpu", "gpu:1", ..., None = JAX's default; `pipeline` is `(init, step)`, None = that of which `config` is.
     Raises SvgfError where there is no such device.
     """
     import jax
 
-    if pipeline is None:
-        from svgf_jax.pipeline import init, step
-    else:
+    if pipeline is not None:
         init, step = pipeline
+    elif isinstance(config, MethodConfig):
+        from svgf_jax.baselines import baseline_init as init
+        from svgf_jax.baselines import baseline_step as step
+    else:
+        from svgf_jax.pipeline import init, step
     chosen = _device(device)
-    on_device = jax.device_put(Params(*(np.asarray(value, np.float32) for value in params)), chosen)
+    on_device = jax.device_put(type(params)(*(np.asarray(value, np.float32) for value in params)), chosen)
     jitted_init, jitted_step = _jitted(init, step, config)
     return Filters(
         init=lambda frame: jitted_init(jax.device_put(frame, chosen)),
@@ -42,11 +48,15 @@ def compile_filters(params: Params, config: Config, *, device: str | None, pipel
 
 
 @cache
-def _jitted(init: Callable[..., History], step: Callable[..., Any], config: Config) -> tuple[Callable, Callable]:
+def _jitted(
+    init: Callable[..., History], step: Callable[..., Any], config: Config | MethodConfig
+) -> tuple[Callable, Callable]:
     """Compiled once a process, however many sequences it denoises."""
     import jax
 
-    start = partial(init, config=config) if config.taa else init  # other pipelines know nothing of it
+    start = (
+        partial(init, config=config) if getattr(config, "taa", False) else init
+    )  # other pipelines know nothing of it
     return jax.jit(start), jax.jit(lambda history, frame, params: step(history, frame, params=params, config=config))
 
 

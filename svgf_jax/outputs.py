@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from svgf_jax import __version__, exr, preview
-from svgf_jax.types import Config, Output, Params
+from svgf_jax.methods import MethodConfig
+from svgf_jax.types import Config, Output
 
 HALF_MAX = 65504.0
 
@@ -35,16 +36,19 @@ class WriteOptions(NamedTuple):
     tonemap: str = preview.CURVE
 
 
-def numbers(params: Params, config: Config) -> dict[str, Any]:
+def numbers(params: Any, config: Config | MethodConfig) -> dict[str, Any]:
     """All parameters and choices as plain JSON numbers (lists where per level)."""
     plain = {name: np.asarray(value).astype(np.float64).tolist() for name, value in params._asdict().items()}
     return {"parameters": plain, "config": config._asdict()}
 
 
-def attributes(source: str, *, preset: str, params: Params, config: Config) -> dict[str, str]:
+def attributes(
+    source: str, *, method: str = "svgf", preset: str, params: Any, config: Config | MethodConfig
+) -> dict[str, str]:
     """The header attributes that say how an output came about."""
     return {
         "svgf_jax:version": __version__,
+        "svgf_jax:method": method,
         "svgf_jax:preset": preset,
         "svgf_jax:parameters": json.dumps(numbers(params, config)),
         "svgf_jax:source": source,
@@ -77,7 +81,7 @@ def compose(
     channels = {} if options.only_denoised else dict(source.channels)
     channels |= {name: plane(image[..., c]) for c, name in enumerate("RGB")}
     if options.diagnostics:
-        for s, variance in enumerate(np.asarray(output.variance)):
+        for s, variance in enumerate(() if output.variance is None else np.asarray(output.variance)):
             name = signals[s] if s < len(signals) else str(s)
             channels[f"svgf.variance.{name}"] = plane(variance)
         channels["svgf.history_length"] = plane(np.asarray(output.history_length))

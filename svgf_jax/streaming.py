@@ -11,13 +11,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from svgf_jax import __version__, checkpoint, exr, frames, outputs, preview, tonemapping
 from svgf_jax.checkpoint import Checkpoint
 from svgf_jax.compiled import Filters, Pipeline, compile_filters, to_host
+from svgf_jax.methods import MethodConfig
 from svgf_jax.outputs import WriteOptions
 from svgf_jax.plan import Files, Plan, begin, make_plan, stamp, written
 from svgf_jax.threads import Submit, read_ahead, write_behind
@@ -75,8 +76,9 @@ def run(
     source: frames.Source,
     out: str | Path,
     *,
-    params: Params = Params(),
-    config: Config = Config(),
+    params: Any = Params(),
+    config: Config | MethodConfig = Config(),
+    method: str = "svgf",
     preset: str = "",
     options: WriteOptions = WriteOptions(),
     video: bool = False,
@@ -98,7 +100,8 @@ def run(
     `source.sequence.missing` says.
 
     Args:
-        preset: the name written into the outputs' attributes.
+        params, config: of `svgf_jax.step`, or of a method of `svgf_jax.methods`: which it is, is told by `config`.
+        method, preset: the names written into the outputs' attributes.
         video: also encode `OUT/NAME.mp4` at `fps` once all frames are there.
         resume: continue an interrupted run; begin one where there is none. Excludes `overwrite`.
         overwrite: replace outputs that exist; without it they are an error.
@@ -106,7 +109,7 @@ def run(
         threads: frames read ahead, and outputs written behind.
         on_frame: called in this thread for each frame once its output is complete, in order.
         stop: asked after each frame; True ends the run with a checkpoint.
-        pipeline: `(init, step)` in place of `svgf_jax.pipeline`'s.
+        pipeline: `(init, step)` in place of the library's.
 
     Raises:
         SvgfError: an option out of range (before any work), unreadable or mismatching input, an unusable output folder,
@@ -120,7 +123,9 @@ def run(
     preview.frame_rate(fps)
     if video:
         preview.require_video()
-    provenance = outputs.attributes(os.path.abspath(source.sequence.name), preset=preset, params=params, config=config)
+    provenance = outputs.attributes(
+        os.path.abspath(source.sequence.name), method=method, preset=preset, params=params, config=config
+    )
     plan = make_plan(
         source.sequence.files,
         Path(out),
@@ -240,14 +245,14 @@ def _read(source: frames.Source, index: int) -> frames.LoadedFrame | None:
 
 
 def _check_size(item: frames.LoadedFrame, history: History | None) -> None:
-    """A history holds only for frames of its own size and signals."""
+    """A history holds only for frames of its own size."""
     if history is None:
         return
-    then, now = history.illumination.shape, item.frame.radiance.shape
+    then, now = history.illumination.shape[1:3], item.frame.depth.shape
     if then != now:
         raise SvgfError(
-            f"{item.path}: this frame is {now[2]} x {now[1]} pixels with {now[0]} signals, the one before it {then[2]} "
-            f"x {then[1]} with {then[0]}; wanted one size throughout. Denoise each part as a sequence (--frames)."
+            f"{item.path}: this frame is {now[1]} x {now[0]} pixels, the one before it {then[1]} x {then[0]}; wanted one "
+            "size throughout. Denoise each part as a sequence (--frames)."
         )
 
 

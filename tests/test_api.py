@@ -19,6 +19,8 @@ def test_the_public_names_are_these():
         *("Config", "Frame", "History", "Output", "Params", "Rejected", "Reprojected", "SvgfError"),
         *("Accumulated", "Guides", "guides_of", "depth_gradient"),
         *("init", "step", "denoise", "taa", "taa_init", "TaaHistory"),
+        *("baseline_init", "baseline_step", "baseline_denoise"),
+        *("method", "MethodConfig"),
         *(
             "sanitise",
             "demodulate",
@@ -70,6 +72,7 @@ def frame_of_zeros(signals=1, height=3, width=4):
     shapes = dict.fromkeys(svgf_jax.Frame._fields, (height, width))
     shapes |= {"radiance": (signals, height, width, 3), "albedo": (1, height, width, 3), "motion": (height, width, 2)}
     shapes |= {"emission": (height, width, 3), "normal": (height, width, 3), "variance": (signals, height, width)}
+    shapes |= {"position": (height, width, 3)}
     types = {name: np.int32 if name == "object_id" else np.float32 for name in shapes}
     return svgf_jax.Frame(**{name: np.zeros(shape, types[name]) for name, shape in shapes.items()})
 

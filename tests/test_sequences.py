@@ -209,5 +209,7 @@ def test_the_real_folders(data):
     assert got.files[3][1] == str(data / "cornell-dolly" / "frame_0003.exr")
     assert len(find_sequence(data / "cornell-dolly", prefer=("ref",)).files) == 16
     assert len(find_sequence(data / "cornell-dolly" / "alt_####.exr").files) == 8
+    for folder in (data / "games202-box", data / "games202-box" / "input"):
+        assert find_sequence(folder).name == str(data / "games202-box" / "input" / "beauty_#.exr")
     with pytest.raises(SvgfError, match=r"several sequences are here: ID_#\.exr, beauty_#\.exr"):
-        find_sequence(data / "games202-box" / "input")
+        find_sequence(data / "games202-box", prefer=("ref",))

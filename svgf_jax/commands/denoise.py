@@ -17,6 +17,16 @@ if TYPE_CHECKING:
 
 Flag = Parameter(negative=(), show_default=False)
 Repeated = Parameter(negative=(), consume_multiple=False, show_default=False)
+Method = Literal[
+    "svgf",
+    "games202",
+    "games202-atrous",
+    "accumulate",
+    "joint-bilateral",
+    "joint-bilateral-atrous",
+    "bilateral",
+    "gaussian",
+]
 Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab"]
 INPUT, FILTER, OUTPUT, RUN = (Group(name, sort_key=i) for i, name in enumerate(["Input", "Filter", "Output", "Run"]))
 
@@ -31,6 +41,7 @@ def denoise(
     channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = (),
     file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = (),
     cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto",
+    method: Annotated[Method, Parameter(group=FILTER)] = "svgf",
     preset: Annotated[str | None, Parameter(metavar="NAME", group=FILTER)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=FILTER)] = None,
     set_: Annotated[tuple[str, ...], Repeated, Parameter(name="--set", metavar="NAME=VALUE", group=FILTER)] = (),
@@ -60,11 +71,14 @@ def denoise(
         missing: A missing frame is an error, repeats the output before it (hold), or starts the history anew (reset).
         channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
         file: The files of a role, for example normal=normal_####.exr. Repeatable.
-        cameras: The cameras.json of the sequence; auto takes the one beside the frames, none ignores it.
-        preset: A preset by name; `svgf-jax params list` shows them.
+        cameras: The cameras.json of the sequence, or matrix_#.mat; auto takes the one beside the frames, none ignores it.
+        method: What to filter with. games202: joint bilateral, then project and accumulate (-atrous: filtered in a-trous
+            passes). accumulate, joint-bilateral, bilateral, gaussian: that part alone.
+        preset: A preset of svgf by name; `svgf-jax params list` shows them.
         params: Parameters from a TOML file; `svgf-jax params show` prints one.
-        set_: One parameter, or one value per a-trous level: sigma_normal=64, sigma_luminance=4,3,2,1,1. Repeatable.
-        taa: Temporal anti-aliasing of the result; the same as --set taa=true.
+        set_: One parameter of the method, or one value per a-trous level: sigma_normal=64, sigma_luminance=4,3,2,1,1.
+            Repeatable.
+        taa: Temporal anti-aliasing of the result; the same as --set taa=true. Of svgf only.
         device: cpu, gpu, gpu:1, ...; what JAX chooses if not given.
         float_: Write 32-bit float instead of 16-bit.
         compression: EXR compression of the output.
@@ -81,7 +95,8 @@ def denoise(
         json: Print a summary as JSON to the standard output; all else goes to the standard error.
         verbose: Also tell which channel plays which role, the parameters and the device.
     """
-    chosen_preset, chosen, config = settings.choose(preset, params, (*set_, "taa=true") if taa else set_)
+    changes = (*set_, "taa=true") if taa else set_
+    chosen_preset, chosen, config = settings.choose_method(method, preset, params, changes)
     roles = settings.assignments(channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
     files = settings.assignments(file, option="--file", example="normal=normal_####.exr")
 
@@ -96,6 +111,7 @@ def denoise(
         channel={role: names.split(",") for role, names in roles.items()},
         file=files,
         cameras=None if cameras == "none" else cameras,
+        position=getattr(config, "filter", "") == "joint-bilateral",
     )
     terminal.warn(source.warnings)
     if verbose:
@@ -103,13 +119,14 @@ def denoise(
         terminal.tell(source.roles.describe())
         values = numbers(chosen, config)
         listed = ", ".join(f"{name} {value}" for name, value in (values["parameters"] | values["config"]).items())
-        terminal.tell(f"preset {chosen_preset}: {listed}")
+        terminal.tell(f"{'preset' if method == 'svgf' else 'method'} {chosen_preset}: {listed}")
     with _until_interrupted() as interruption, terminal.progress(len(source.sequence.files)) as on_frame:
         summary = streaming.run(
             source,
             out,
             params=chosen,
             config=config,
+            method=method,
             preset=chosen_preset,
             options=WriteOptions(float_, compression, only_denoised, diagnostics, png, exposure, tonemap),
             video=video,
@@ -123,7 +140,7 @@ def denoise(
         )
     _conclude(summary, verbose=verbose)
     if json:
-        terminal.print_json(summary._asdict() | {"preset": chosen_preset} | numbers(chosen, config))
+        terminal.print_json(summary._asdict() | {"method": method, "preset": chosen_preset} | numbers(chosen, config))
     if summary.interrupted:
         again = [argument for argument in sys.argv[1:] if argument != "--overwrite"]
         again = again if "--resume" in again else [*again, "--resume"]

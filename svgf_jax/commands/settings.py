@@ -1,9 +1,10 @@
 """Options that set numbers and names: `--preset`, `--params`, `--set NAME=VALUE`, `--channel ROLE=...`. No JAX."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from svgf_jax.methods import METHOD_CHOICES, MethodConfig, check_settable, override_method
 from svgf_jax.types import CHOICES, Config, Params, SvgfError, choices_of
 
 Tonemap = Literal["reinhard-extended", "reinhard", "aces-narkowicz", "aces-hill", "linear"]  # tonemapping.CURVES
@@ -18,9 +19,27 @@ def choose(preset: str | None, file: Path | None, changes: Iterable[str]) -> tup
     name = preset or "paper"
     params, config = parameters.preset(name) if file is None else parameters.load_params(file)
     texts = assignments(changes, option="--set", example="sigma_normal=64")
+    check_settable("svgf", texts)
     params, config = parameters.override(params, config, {key: _value(key, text) for key, text in texts.items()})
     record = name if file is None else file.name
     return " ".join([record, *(f"{key}={text}" for key, text in texts.items())]), params, config
+
+
+def choose_method(
+    method: str, preset: str | None, file: Path | None, changes: Iterable[str]
+) -> tuple[str, Any, Config | MethodConfig]:
+    """The same for any method."""
+    if method == "svgf":
+        return choose(preset, file, changes)
+    for option, given in (("--preset", preset), ("--params", file)):
+        if given is not None:
+            raise SvgfError(
+                f"Got {option} {given} and --method {method}; {option} is of svgf. --set changes single values."
+            )
+    texts = assignments(changes, option="--set", example="sigma_color=0.3")
+    check_settable(method, texts)
+    values = {key: _value(key, text, METHOD_CHOICES) for key, text in texts.items()}
+    return " ".join([method, *(f"{key}={text}" for key, text in texts.items())]), *override_method(method, values)
 
 
 def assignments(texts: Iterable[str], *, option: str, example: str) -> dict[str, str]:
@@ -41,12 +60,12 @@ def _split(text: str, *, option: str, example: str) -> tuple[str, str]:
     return key, value
 
 
-def _value(key: str, text: str) -> Any:
-    """A number, or a comma list of one per a-trous level; for a field of `Config` one of its choices."""
-    if key in Config._fields:
-        named = {str(value).lower(): value for value in CHOICES[key]}
+def _value(key: str, text: str, choices: Mapping[str, range | tuple] = CHOICES) -> Any:
+    """A number, or a comma list of one per a-trous level; for a choice one of its values."""
+    if key in choices:
+        named = {str(value).lower(): value for value in choices[key]}
         if text.lower() not in named:
-            raise SvgfError(f"Got --set {key}={text}; wanted {choices_of(key)}.")
+            raise SvgfError(f"Got --set {key}={text}; wanted {choices_of(key, choices=choices)}.")
         return named[text.lower()]
     try:
         values = [float(item) for item in text.split(",")]
