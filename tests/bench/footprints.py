@@ -1,6 +1,6 @@
 """Time and error of the footprints of the joint bilateral filter against `full`, on a real frame.
 
-    python tests/bench/footprints.py [cornell-dolly|games202-box] [--rounds 5] [--picture footprints.png]
+    python tests/bench/footprints.py [cornell-dolly|games202-box] [--rounds 5]
 
 Prints a Markdown table. Times are medians of rounds in which all forms of a radius take turns, as ratios to `full`; errors are RMSE
 on x / (1 + x) against the `full` of the same radius, over the pixels with a surface. sigma_space = radius, the other sigmas are
@@ -61,7 +61,6 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("name", nargs="?", default="games202-box")
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--picture")
     asked = parser.parse_args()
     frame = read(asked.name)
     surface = frame[-1]
