@@ -2,13 +2,14 @@
 
 import json
 import os
-import shutil
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import opened
 
 from svgf_jax import Config, Params, exr, load_params
 from svgf_jax.demo import sample
@@ -83,26 +84,23 @@ def test_references_of_another_size_and_missing_ones(shots, tmp_path):
     assert not (tmp_path / "t.toml").exists()
 
 
-def test_tunes_validates_reports(shots, tmp_path):
-    """A few steps on the first frames, validated on the rest: the file, the numbers, the page, the maps."""
-    out, page = tmp_path / "tuned.toml", tmp_path / "report.html"
-    options = [
-        "--tune",
-        "alpha,sigma_luminance,max_history",
-        "--set",
-        "levels=1",
-        "--frames",
-        "0-5",
-        "--max-steps",
-        "2",
-    ]
-    options += ["--validate", shots, "--validate-reference", shots, "--validate-frames", "6-9", "--accept", "--json"]
-    done = command(
-        shots, "--reference", shots, "-o", out, "--report", page, "--maps", tmp_path / "maps", "--profiles", *options
-    )
+@pytest.fixture(scope="module")
+def tuned(shots, tmp_path_factory):
+    """A few steps on the first frames, validated on the rest: (the finished command, its folder)."""
+    folder = tmp_path_factory.mktemp("tuned")
+    what = ["--tune", "alpha,sigma_luminance,max_history", "--set", "levels=1", "--frames", "0-5", "--max-steps", "2"]
+    held = ["--validate", shots, "--validate-reference", shots, "--validate-frames", "6-9", "--accept", "--json"]
+    files = ["-o", folder / "tuned.toml", "--report", folder / "report.html", "--maps", folder / "maps", "--profiles"]
+    done = command(shots, "--reference", shots, *files, *what, *held)
     assert done.returncode == 0, done.stderr
+    return done, folder
+
+
+def test_tunes_validates_reports(shots, tuned):
+    """The file, the numbers, the page, the maps."""
+    done, folder = tuned
     assert "loss" in done.stderr
-    params, config = load_params(out)
+    params, config = load_params(folder / "tuned.toml")
     assert config == Config(levels=1)
     assert params.alpha != Params().alpha
     result = json.loads(done.stdout)
@@ -111,38 +109,40 @@ def test_tunes_validates_reports(shots, tmp_path):
     assert result["loss"] < 1
     assert "max_history" in result["undetermined"]
     assert len(result["profiles"]) == 3
-    maps = exr.read(tmp_path / "maps" / "sensitivity.exr")
+    maps = exr.read(folder / "maps" / "sensitivity.exr")
     assert set(maps.channels) == {"error", "slope.alpha", "slope.sigma_luminance", "slope.max_history"}
-    html = page.read_text()
+    html = (folder / "report.html").read_text()
     assert "http" not in html.replace("http://www.w3.org", "")  # self-contained
-    for word in (
-        "Loss",
-        "Parameters",
-        "undetermined",
-        "Before and after",
-        "Frame by frame",
-        "Profiles",
-        "slider",
-        "<svg",
-    ):
-        assert word in html.replace("range", "slider")
-    assert not list(tmp_path.glob(".*progress*"))
-    again = command(shots, "--reference", shots, "-o", out)
+    for word in ("Loss", "Parameters", "undetermined", "Before and after", "Frame by frame", "Profiles", "<svg"):
+        assert word in html
+    assert not list(folder.glob(".*progress*"))
+    again = command(shots, "--reference", shots, "-o", folder / "tuned.toml")
     assert again.returncode == 2
     assert "exists already" in again.stderr
 
 
-def test_the_page_opens_in_a_browser(tmp_path):
-    """Headless Chromium draws the page: its text is there, and its script has no error."""
-    browser = next(
-        (b for name in ("chromium", "chromium-browser", "google-chrome", "chrome") if (b := shutil.which(name))), None
-    )
-    if browser is None:
-        pytest.skip("no Chromium here to look at the page with")
-    from tune.report import plot
+def test_the_page_works_in_a_browser(tuned, tmp_path):
+    """Headless Chromium draws its pictures, its slider moves them, and its console stays silent."""
+    script = """
+        const images = [...document.images], range = document.querySelector('input[type=range]');
+        range.value = 20;
+        range.dispatchEvent(new Event('input'));
+        Promise.all(images.map(i => i.decode())).then(() => document.title =
+            `${images.length} of ${images.filter(i => i.naturalWidth > 0).length} ${images[1].style.clipPath}`);
+    """
+    dom = opened(tuned[1] / "report.html", tmp_path, script=script)
+    count, drawn, clip = re.search(r"<title>(\d+) of (\d+) (.*?)</title>", dom).groups()
+    assert int(count) == int(drawn) >= 4 + 3  # two sliders of two pictures, the error's map and two slopes'
+    assert clip.startswith("inset(0px 80% 0px 0px")
+    assert "<polyline" in dom
 
-    page = tmp_path / "page.html"
-    page.write_text(f"<body>{plot([('a', [0, 1, 2], [3.0, 1.0, 2.0])], title='curve')}</body>")
-    call = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", f"file://{page}"]
-    done = subprocess.run(call, capture_output=True, text=True, timeout=60)
-    assert "polyline" in done.stdout
+
+def test_worse_validation_is_an_error_and_loses_nothing(shots, tmp_path):
+    """Tuned to leave the noise in, it must fail on the real references: exit code 1, and yet the file is there."""
+    out = tmp_path / "t.toml"
+    start = ["--set", "levels=0", "--set", "alpha=0.5", "--tune", "alpha", "--max-steps", "3", "-o", out]
+    held = ["--validate", shots, "--validate-reference", shots, "--validate-frames", "4-9", "--frames", "0-3"]
+    done = command(shots, "--reference", shots / "frame_####.exr", *start, *held)
+    assert done.returncode == 1, done.stderr
+    assert "VALIDATION GOT WORSE" in done.stderr
+    assert load_params(out)[0].alpha > 0.6
