@@ -1,5 +1,7 @@
 """The page about a fit, without fitting anything, and the words about it."""
 
+import io
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from tune.fitting import Fit, Iteration
 from tune.free import choose, to_free
 from tune.knowledge import learn
 from tune.report import plot, write_report
+from tune.telling import live
 
 
 def made_fit():
@@ -32,7 +35,9 @@ def test_standard_errors_are_those_of_the_textbook():
     jacobian = np.column_stack([rng.normal(size=4000), rng.normal(size=4000), np.zeros(4000)])
     jacobian[:, 1] += 3 * jacobian[:, 0]
     residual = 0.1 * rng.normal(size=4000)
-    knowledge = learn(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"), np.zeros((3, 3)), 4000, y, coordinates)
+    knowledge = learn(
+        np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"), np.zeros((3, 3)), 4000, y, coordinates
+    )
     covariance = 0.01 * np.linalg.inv(jacobian[:, :2].T @ jacobian[:, :2])
     np.testing.assert_allclose(knowledge.relative_errors[:2], np.sqrt(np.diag(covariance)), rtol=0.05)
     assert knowledge.undetermined == ("max_history",)
@@ -60,7 +65,7 @@ def test_the_page_holds_everything_and_escapes_it(tmp_path):
     told = ("converged: &lt;done&gt;", "worse &amp; worse", "a note", "undetermined")
     for wanted in (*told, "loss over log10 alpha", "data:image/png"):
         assert wanted in text
-    assert "src=\"http" not in text
+    assert 'src="http' not in text
     channels = write_maps(tmp_path / "maps", fit, maps)
     assert channels.name == "sensitivity.exr"
 
@@ -76,3 +81,23 @@ def test_worse_is_worse():
     assert "39.90" in str(worse(scores[0], scores[1], tolerance=0.05))
     assert worse(scores[0], scores[1], tolerance=0.2) is None
     assert worse(scores[0], scores[2]) is not None
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(("stream", "labels"), [(Terminal, 2), (Terminal, 9), (io.StringIO, 2)])
+def test_every_trial_point_is_told_with_its_numbers(stream, labels, monkeypatch):
+    """A table on a terminal, a line each elsewhere: which number is whose can be seen."""
+    monkeypatch.setenv("COLUMNS", "110")
+    monkeypatch.setattr("sys.stderr", told := stream())
+    names = [f"number{i}" for i in range(labels)]
+    with live(2, 24, names) as on_iteration:
+        for i, accepted in enumerate((True, False)):
+            on_iteration(Iteration(0, i, 1 - 0.25 * i, accepted, np.arange(labels) + 0.125, 1.0))
+    text = told.getvalue()
+    assert all(name in text for name in names)
+    for wanted in ("2 sequences, 24 frames", "0.1", "0.75000", "accepted", "rejected", "0.125", "1.125"):
+        assert wanted in text

@@ -123,7 +123,7 @@ def command(
     import tune.checkpoint as checkpoints
     from tune import residuals
     from tune.fitting import fit
-    from tune.free import TUNED_BY_DEFAULT
+    from tune.free import TUNED_BY_DEFAULT, choose
     from tune.shots import shot_of_files
     from tune.telling import conclude, live
 
@@ -144,6 +144,7 @@ def command(
         terms = residuals.reference_terms(space=space, temporal=temporal, robust=robust, width=robust_width, **weight)
     names = _names(tune) or TUNED_BY_DEFAULT
     levels: Any = True if per_level == "all" else _names(per_level)
+    labels = choose(start, config, names=names, per_level=levels, freeze=_names(freeze)).labels
     identity = {
         "sequences": noisy,
         "reference": second or reference,
@@ -158,7 +159,8 @@ def command(
         "seed": seed,
     }
     terminal.warn(note for shot in (*shots, *held) for note in shot.notes)
-    with _terminated_as_interrupted(), live(len(shots), sum(shot.length for shot in shots)) as on_iteration:
+    length = sum(shot.length for shot in shots)
+    with _terminated_as_interrupted(), live(len(shots), length, labels) as on_iteration:
         found = fit(
             start,
             config,

@@ -40,26 +40,28 @@ class Comparison(NamedTuple):
 
 
 @contextmanager
-def live(shots: int, frames: int) -> Iterator[Callable[[Iteration], None]]:
-    """A function to call with each trial point: a growing table on a terminal, a line each elsewhere."""
+def live(shots: int, frames: int, labels: Sequence[str]) -> Iterator[Callable[[Iteration], None]]:
+    """A function to call with each trial point of `labels`: a growing table on a terminal, a line each elsewhere."""
     terminal.tell(
         f"tuning on {shots} {'sequence' if shots == 1 else 'sequences'}, {frames} frames; the first trial compiles"
     )
     began = time.monotonic()
-    with _table(began) if sys.stderr.isatty() else _lines(began) as on_iteration:
+    with _table(began, labels) if sys.stderr.isatty() else _lines(began, labels) as on_iteration:
         yield on_iteration
 
 
 @contextmanager
-def _lines(began: float) -> Iterator[Callable[[Iteration], None]]:
+def _lines(began: float, labels: Sequence[str]) -> Iterator[Callable[[Iteration], None]]:
     def on_iteration(iteration: Iteration) -> None:
-        terminal.tell("  ".join(_cells(iteration, began)))
+        number, loss, *rest = _cells(iteration, began)
+        terminal.tell("  ".join((number, f"loss {loss}", *rest)))
 
+    terminal.tell(f"start.trial  loss  {' '.join(labels)}  time")
     yield on_iteration
 
 
 @contextmanager
-def _table(began: float) -> Iterator[Callable[[Iteration], None]]:
+def _table(began: float, labels: Sequence[str]) -> Iterator[Callable[[Iteration], None]]:
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.live import Live
@@ -67,12 +69,15 @@ def _table(began: float) -> Iterator[Callable[[Iteration], None]]:
     from rich.text import Text
 
     table = Table(box=SIMPLE)
-    for name in ("start.trial", "loss", "", "parameters", "time"):
-        table.add_column(name, no_wrap=name != "parameters")
+    wide = len(labels) > 6  # one column each would not fit
+    for name in ("trial", "loss", "", *((" ".join(labels),) if wide else labels), "time"):
+        table.add_column(Text(name), no_wrap=not wide or name != " ".join(labels))
     with Live(table, console=Console(stderr=True), auto_refresh=False) as view:
 
         def on_iteration(iteration: Iteration) -> None:
-            table.add_row(*map(Text, _cells(iteration, began)))
+            number, loss, verdict, values, seconds = _cells(iteration, began)
+            between = [values] if wide else values.split()
+            table.add_row(*map(Text, (number, loss, verdict, *between, seconds)))
             view.refresh()
 
         yield on_iteration
@@ -82,7 +87,7 @@ def _cells(iteration: Iteration, began: float) -> tuple[str, ...]:
     verdict = "accepted" if iteration.accepted else "rejected"
     values = " ".join(f"{value:.4g}" for value in iteration.values)
     seconds = f"{time.monotonic() - began:.0f} s"
-    return (f"{iteration.start}.{iteration.number}", f"loss {iteration.loss:.5f}", verdict, values, seconds)
+    return (f"{iteration.start}.{iteration.number}", f"{iteration.loss:.5f}", verdict, values, seconds)
 
 
 def conclude(
