@@ -5,6 +5,7 @@ Fits see a window of each frame, so that a run takes minutes; scores are of whol
     python tests/bench/tune_real.py scalar:cornell-dolly+gallery-pan level:cornell-dolly ...   (kind:sequences to tune on)
     python tests/bench/tune_real.py steady:cornell-dolly+lights-flicker          (scalar, the temporal error at weight 1.5)
     python tests/bench/tune_real.py noisy:cornell-dolly clean:cornell-dolly       (8 frames: second noisy render, reference)
+    python tests/bench/tune_real.py all-level:cornell-dolly+gallery-pan+lights-flicker        (the preset `tuned`)
     python tests/bench/tune_real.py loo                                                        (scalar, each pair of sequences)
 
 Results are added to tests/bench/tune_real.json.
@@ -48,11 +49,11 @@ def tuned(kind: str, names: list[str], **options) -> dict:
     shots = [
         first_frames(name, "alt" if noisy else "ref") if kind in ("noisy", "clean") else shot(name) for name in names
     ]
-    if kind == "all":  # starts where the pairs of sequences ended, in the mean
-        found = [result["params"] for key, result in stored().items() if key.startswith("scalar:") and "+" in key]
-        params = Params(
-            *(float(np.exp(np.mean(np.log(values)))) for values in zip(*(f.values() for f in found), strict=True))
-        )
+    if kind.startswith("all-"):  # starts where the pairs of sequences ended, in the mean
+        before = kind.removeprefix("all-")
+        found = [result["params"] for key, result in stored().items() if key.startswith(f"{before}:") and "+" in key]
+        leaves = zip(*(f.values() for f in found), strict=True)
+        params = Params(*(np.exp(np.mean(np.log(values), axis=0)) for values in leaves))
     if kind == "level" and (before := stored().get(f"scalar:{'+'.join(names)}")):
         params = Params(**{k: np.asarray(v) for k, v in before["params"].items()})  # the scalars are the start
     began = time.monotonic()
@@ -67,7 +68,7 @@ def tuned(kind: str, names: list[str], **options) -> dict:
         config,
         [window(s, **WINDOW) for s in shots],
         noisy_terms() if noisy else reference_terms(**options),
-        per_level=PER_LEVEL if kind == "level" else (),
+        per_level=PER_LEVEL if kind.endswith("level") else (),
         on_iteration=tell,
         least_gain=1e-5 if noisy else 5e-3,
         max_steps=9,

@@ -1,0 +1,113 @@
+"""This library beside others and beside its own parts: error, flicker and time of each, frame by frame over whole sequences.
+
+    pip install '.[bench,flip]'        (pyoidn is Intel Open Image Denoise)
+    python tests/bench/denoisers.py FOLDER... [--only paper,adaptive] [--frames 0-7] [--no-flip]
+
+A FOLDER holds frame_####.exr and ref_####.exr. PSNR, relMSE, FLIP and temporal error are means over all frames, as
+`svgf-jax compare` measures them; seconds are the median of a frame, compilation and reading left out. Open Image Denoise sees each
+frame alone: color, albedo and normal (`oidn`), and with the guides declared clean (`oidn clean`). Results are added to
+tests/bench/denoisers.json.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from svgf_jax import Config, Frame, Params, init, load_reference, open_source, preset, read_frame, step
+from svgf_jax.metrics import mean_scores, score
+
+RESULTS = Path(__file__).with_suffix(".json")
+Denoiser = Callable[[Iterator[Frame]], Iterator[tuple[np.ndarray, float]]]  # (image, seconds) of each frame
+
+
+def svgf(params: Params, config: Config) -> Denoiser:
+    def run(frames: Iterator[Frame]) -> Iterator[tuple[np.ndarray, float]]:
+        leaves = Params(*(np.asarray(leaf, np.float32) for leaf in params))
+        history = None
+        for frame in frames:
+            if history is None:
+                history = init(frame)
+                jax.block_until_ready(step(history, frame, params=leaves, config=config))  # compiles
+            began = time.monotonic()
+            history, output = jax.block_until_ready(step(history, frame, params=leaves, config=config))
+            yield np.asarray(output.image), time.monotonic() - began
+
+    return run
+
+
+def beauty(frame: Frame) -> np.ndarray:
+    return np.asarray(frame.radiance.sum(axis=0) + frame.emission, np.float32)
+
+
+def noisy(frames: Iterator[Frame]) -> Iterator[tuple[np.ndarray, float]]:
+    for frame in frames:
+        yield beauty(frame), 0.0
+
+
+def oidn(*, clean: bool) -> Denoiser:
+    import pyoidn
+
+    def run(frames: Iterator[Frame]) -> Iterator[tuple[np.ndarray, float]]:
+        for frame in frames:
+            # What is not reflected at a surface is its own albedo, as OIDN's documentation asks.
+            surface = (np.asarray(frame.object_id) != -1)[..., None]
+            albedo = np.where(surface, np.clip(frame.albedo[0], 0, 1), np.clip(frame.emission, 0, 1))
+            guides = {"albedo": np.float32(albedo), "normal": np.float32(frame.normal)}
+            began = time.monotonic()
+            image = pyoidn.denoise(beauty(frame), **guides, hdr=True, clean_aux=clean, quality="high")
+            yield np.asarray(image), time.monotonic() - began
+
+    return run
+
+
+def denoisers() -> dict[str, Callable[[], Denoiser]]:
+    paper = Params()
+    presets = {name: lambda name=name: svgf(*preset(name)) for name in ("paper", "falcor", "tuned", "adaptive")}
+    return {
+        "noisy": lambda: noisy,
+        "accumulation alone": lambda: svgf(paper, Config(levels=0)),
+        "a-trous alone": lambda: svgf(paper._replace(alpha=1.0, alpha_moments=1.0), Config()),
+        **presets,
+        "oidn": lambda: oidn(clean=False),
+        "oidn clean": lambda: oidn(clean=True),
+    }
+
+
+def measure(folder: Path, denoiser: Denoiser, frames: str | None, flip: bool) -> dict[str, float]:
+    source = open_source(str(folder), frames=frames)
+    count = len(source.sequence.files)
+    references = load_reference(str(folder), frames=frames)
+    scores, seconds, previous = [], [], None
+    read = (read_frame(source, i).frame for i in range(count))
+    for (image, spent), reference in zip(denoiser(read), references, strict=True):
+        scores.append(score(image, reference, previous=previous, with_flip=flip))
+        previous = (image, reference)
+        seconds.append(spent)
+    return mean_scores(scores)._asdict() | {"seconds": float(np.median(seconds)), "frames": count}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("--only")
+    parser.add_argument("--frames")
+    parser.add_argument("--no-flip", action="store_true")
+    given = parser.parse_args()
+    known = denoisers()
+    names = given.only.split(",") if given.only else list(known)
+    for folder in given.folders:
+        for name in names:
+            result = measure(folder, known[name](), given.frames, not given.no_flip)
+            stored = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+            stored.setdefault(folder.name, {})[name] = result
+            RESULTS.write_text(json.dumps(stored, indent=1) + "\n")
+            print(f"{folder.name:16} {name:20}", "  ".join(f"{k} {v:.4g}" for k, v in result.items()), flush=True)
+
+
+if __name__ == "__main__":
+    main()
