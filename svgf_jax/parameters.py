@@ -33,6 +33,20 @@ PRESETS: dict[str, tuple[Params, Config]] = {
         Params(alpha=0.05, sigma_luminance=10.0, short_history_boost=4.0),
         Config(levels=4, feedback_level=1),
     ),
+    # Fitted by svgf-tune from `paper` to three one-sample sequences; see svgf_jax/docs/tuning.md.
+    "tuned": (
+        Params(
+            alpha=0.886,
+            alpha_moments=0.309,
+            sigma_depth=0.174,
+            sigma_normal=(6.9, 10.1, 68.9, 117.0, 35.8),
+            sigma_luminance=(447.0, 12.95, 6.4, 6.36, 7.23),
+            depth_epsilon=0.0383,
+            kernel_near=(0.746, 0.835, 0.783, 0.632, 0.825),
+            kernel_far=0.215,
+        ),
+        Config(),
+    ),
     "adaptive": (
         Params(alpha=0.3, sigma_luminance=(12.0, 8.0, 3.5, 2.5, 1.5), short_history_boost=6.0),
         Config(light_cell=4),
@@ -68,8 +82,8 @@ BOUNDS: dict[str, tuple[float, float]] = {
 
 
 def preset(name: str) -> tuple[Params, Config]:
-    """The parameters and choices of a preset: `paper` (Schied et al. 2017), `falcor` (NVIDIA Falcor's SVGFPass), or
-    `adaptive`, which follows changes of the light.
+    """The parameters and choices of a preset: `paper` (Schied et al. 2017), `falcor` (NVIDIA Falcor's SVGFPass), `tuned` (the
+    paper's filter with numbers fitted to one-sample path tracing), or `adaptive`, which follows changes of the light.
     """
     if name not in PRESETS:
         raise SvgfError(f"no preset {name!r}; there are {', '.join(PRESETS)}{_suggest(name, PRESETS)}")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import svgf_jax as sj
-from svgf_jax.parameters import override
+from svgf_jax.parameters import PRESETS, override
 
 
 def test_presets_are_those_of_the_paper_and_of_falcor():
@@ -25,6 +25,16 @@ def test_a_file_reads_back_to_the_same_numbers(tmp_path):
     for got, wanted in zip(loaded, params, strict=True):
         np.testing.assert_array_equal(got, wanted)
     assert [p.name for p in tmp_path.iterdir()] == ["p.toml"]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_keeps_to_its_bounds_and_reads_back(name, tmp_path):
+    params, config = override(*sj.preset(name), {})
+    sj.save_params(tmp_path / "p.toml", params, config)
+    loaded, again = sj.load_params(tmp_path / "p.toml")
+    assert again == config
+    for got, wanted in zip(loaded, params, strict=True):
+        np.testing.assert_array_equal(got, wanted)
 
 
 def test_a_file_may_build_on_a_preset(tmp_path):

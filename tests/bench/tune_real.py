@@ -52,8 +52,7 @@ def tuned(kind: str, names: list[str], **options) -> dict:
     if kind.startswith("all-"):  # starts where the pairs of sequences ended, in the mean
         before = kind.removeprefix("all-")
         found = [result["params"] for key, result in stored().items() if key.startswith(f"{before}:") and "+" in key]
-        leaves = zip(*(f.values() for f in found), strict=True)
-        params = Params(*(np.exp(np.mean(np.log(values), axis=0)) for values in leaves))
+        params = Params(**{k: np.exp(np.mean(np.log([f[k] for f in found]), axis=0)) for k in found[0]})
     if kind == "level" and (before := stored().get(f"scalar:{'+'.join(names)}")):
         params = Params(**{k: np.asarray(v) for k, v in before["params"].items()})  # the scalars are the start
     began = time.monotonic()
