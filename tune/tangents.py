@@ -80,7 +80,9 @@ def compile_pass(free: tuple[Free, ...], config: Config, terms: tuple[Term, ...]
     """The functions that run one frame at free coordinates `y` `[n]`, residuals in the order of `terms`; compiled once."""
     one = partial(_one_frame, free=free, config=config, terms=terms)
     jit = partial(jax.jit, compiler_options=dict(COMPILER_OPTIONS))
-    return FramePass(start=jit(partial(_start, config)), plain=jit(partial(_plain, one)), linear=jit(partial(_linear, one)))
+    return FramePass(
+        start=jit(partial(_start, config)), plain=jit(partial(_plain, one)), linear=jit(partial(_linear, one))
+    )
 
 
 def no_tangents(carry: Carry, directions: int) -> Smooth:
