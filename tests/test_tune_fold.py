@@ -102,6 +102,8 @@ def test_choice_of_numbers():
     chosen = choose(Params(), CONFIG, names=["sigma_luminance", "alpha"], per_level=True, freeze=["sigma_luminance[0]"])
     assert chosen.labels == (*(f"sigma_luminance[{i}]" for i in range(1, 5)), "alpha")
     assert set(GATES) <= set(choose(Params(), CONFIG, names=["all"]).labels)
+    assert "clamp_sigma" not in choose(Params(), CONFIG, names=["all"]).labels
+    assert "clamp_sigma" in choose(Params(), CONFIG._replace(clamp_radius=3), names=["all"]).labels
 
 
 def test_a_start_on_its_bound_is_moved_inside_and_told():
@@ -120,6 +122,7 @@ def test_a_start_on_its_bound_is_moved_inside_and_told():
         ({"names": ["sigma_depth[x]"]}, "one level of it"),
         ({"names": ["alpha"], "per_level": ["alpha"]}, "per level"),
         ({"names": ["alpha"], "freeze": ["alpha"]}, "nothing is left"),
+        ({"names": ["clamp_sigma"]}, "nothing reads clamp_sigma"),
     ],
 )
 def test_what_cannot_be_tuned_says_so(options, said):
