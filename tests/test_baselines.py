@@ -17,7 +17,6 @@ from svgf_jax.commands import denoise, settings
 from svgf_jax.frames import load_sequence, open_source
 from svgf_jax.methods import METHODS, method
 from svgf_jax.outputs import WriteOptions
-from svgf_jax.types import Frame, unread
 
 SIZE = (10, 36)
 RADIUS = 3
@@ -250,10 +249,3 @@ def test_numbers_are_set_by_name():
     assert (params.sigma_color, params.alpha, config.radius, config.fallback) == (0.3, 0.2, 8, True)
     with pytest.raises(SvgfError, match="Did you mean games202"):
         method("games2002")
-
-
-def test_what_nothing_reads_is_not_tuned():
-    _, config = settings.choose(None, None, [])[1:]
-    assert "clamp_sigma" in unread(config)
-    assert "clamp_sigma" not in unread(config._replace(clamp_radius=3))
-    assert isinstance(to_frame(scenes.flat(2, 2)), Frame)

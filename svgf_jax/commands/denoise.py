@@ -72,12 +72,10 @@ def denoise(
         channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
         file: The files of a role, for example normal=normal_####.exr. Repeatable.
         cameras: The cameras.json of the sequence, or matrix_#.mat; auto takes the one beside the frames, none ignores it.
-        method: What to filter with. games202: joint bilateral, then project and accumulate (-atrous: filtered in a-trous
-            passes). accumulate, joint-bilateral, bilateral, gaussian: that part alone.
+        method: games202: joint bilateral, then project and accumulate; the others are parts, -atrous in a-trous passes.
         preset: A preset of svgf by name; `svgf-jax params list` shows them.
         params: Parameters from a TOML file; `svgf-jax params show` prints one.
-        set_: One parameter of the method, or one value per a-trous level: sigma_normal=64, sigma_luminance=4,3,2,1,1.
-            Repeatable.
+        set_: One parameter, or one value per a-trous level: sigma_normal=64, sigma_luminance=4,3,2,1,1. Repeatable.
         taa: Temporal anti-aliasing of the result; the same as --set taa=true. Of svgf only.
         device: cpu, gpu, gpu:1, ...; what JAX chooses if not given.
         float_: Write 32-bit float instead of 16-bit.
