@@ -13,6 +13,7 @@ from tune.fold import combine, factor_blocks, fold
 from tune.free import GATES, PER_LEVEL, choose, from_free, natural, params_at, slope, to_free
 
 CONFIG = Config()
+ALL_ON = CONFIG._replace(light_cell=4, variance="temporal", clamp_radius=3, taa=True, outlier_radius=3)  # all are read
 
 
 @settings(deadline=None)
@@ -60,7 +61,7 @@ def test_fold_stays_accurate_where_normal_equations_do_not():
 @settings(deadline=None)
 @given(st.sampled_from(sorted(BOUNDS)), st.floats(-200, 200))
 def test_free_coordinates_never_leave_the_bounds(name, y):
-    coordinates = choose(Params(), CONFIG, names=[name])
+    coordinates = choose(Params(), ALL_ON, names=[name])
     least, most = BOUNDS[name]
     value = natural(np.array([y]), coordinates)[0]
     assert least <= value <= most
@@ -73,7 +74,7 @@ def test_free_coordinates_never_leave_the_bounds(name, y):
 @pytest.mark.parametrize("per_level", [False, True])
 def test_free_coordinates_there_and_back(per_level):
     params = Params(short_history_boost=3.0, sigma_luminance=np.array([4.0, 3.0, 2.0, 2.0, 1.0]))
-    coordinates = choose(params, CONFIG, names=["all"], per_level=per_level)
+    coordinates = choose(params, ALL_ON, names=["all"], per_level=per_level)
     y = to_free(coordinates.start, coordinates)
     traced, host = from_free(jnp.asarray(y), coordinates.start, coordinates.free), params_at(y, coordinates)
     for name, value in params._asdict().items():
@@ -88,7 +89,7 @@ def test_free_coordinates_there_and_back(per_level):
 
 
 def test_slope_is_the_derivative_of_the_value():
-    coordinates = choose(Params(short_history_boost=2.0), CONFIG, names=["all"])
+    coordinates = choose(Params(short_history_boost=2.0), ALL_ON, names=["all"])
     y = to_free(coordinates.start, coordinates)
     jacobian = jax.jacfwd(
         lambda y: jnp.stack([jnp.asarray(leaf) for leaf in from_free(y, coordinates.start, coordinates.free)])
