@@ -25,7 +25,9 @@ RESULTS = Path(__file__).with_suffix(".json")
 Denoiser = Callable[[Iterator[Frame]], Iterator[tuple[np.ndarray, float]]]  # (image, seconds) of each frame
 
 
-def svgf(params: Params, config: Config) -> Denoiser:
+def svgf(params: Params, config: Config, *, alone: bool = False) -> Denoiser:
+    """`alone`: each frame as if it were the first."""
+
     def run(frames: Iterator[Frame]) -> Iterator[tuple[np.ndarray, float]]:
         leaves = Params(*(np.asarray(leaf, np.float32) for leaf in params))
         history = None
@@ -34,6 +36,7 @@ def svgf(params: Params, config: Config) -> Denoiser:
                 history = init(frame)
                 jax.block_until_ready(step(history, frame, params=leaves, config=config))  # compiles
             began = time.monotonic()
+            history = init(frame) if alone else history
             history, output = jax.block_until_ready(step(history, frame, params=leaves, config=config))
             yield np.asarray(output.image), time.monotonic() - began
 
@@ -71,7 +74,7 @@ def denoisers() -> dict[str, Callable[[], Denoiser]]:
     return {
         "noisy": lambda: noisy,
         "accumulation alone": lambda: svgf(paper, Config(levels=0)),
-        "a-trous alone": lambda: svgf(paper._replace(alpha=1.0, alpha_moments=1.0), Config()),
+        "a-trous alone": lambda: svgf(paper, Config(), alone=True),
         **presets,
         "oidn": lambda: oidn(clean=False),
         "oidn clean": lambda: oidn(clean=True),
