@@ -50,6 +50,7 @@ def atrous_filter(
             scalars=scalars,
             step_size=step_size,
             largest_step=2 ** (config.levels - 1),
+            prefilter=config.prefilter,
             strip_rows=strip_rows,
         )
         feedback = jax.tree.map(lambda new, old: jnp.where(feeds_back, new, old), colors, feedback)
@@ -75,11 +76,12 @@ def atrous_level(
     *,
     level: int,
     params: Params,
+    prefilter: bool = True,
     strip_rows: int | None = STRIP_ROWS,
 ) -> tuple[Array, Array]:
     """One level: C' = sum h w C / sum h w and V' = sum h^2 w^2 V / (sum h w)^2 over 5 x 5 taps 2**level apart (equations 1, 2).
 
-    A zero sum of weights keeps the pixel. Shapes as in `atrous_filter`.
+    A zero sum of weights keeps the pixel. Shapes as in `atrous_filter`; `prefilter` as in `Config`.
     """
     colors, variances = _filter_planes(
         tuple(planes(signal) for signal in illumination),
@@ -89,6 +91,7 @@ def atrous_level(
         scalars=at_level(params, level),
         step_size=2**level,
         largest_step=2**level,
+        prefilter=prefilter,
         strip_rows=strip_rows,
     )
     return stack_planes(colors), jnp.stack(variances)
@@ -103,12 +106,13 @@ def _filter_planes(
     scalars: Params,
     step_size: int | Array,
     largest_step: int,
+    prefilter: bool,
     strip_rows: int | None,
 ) -> tuple[tuple[tuple[Array, ...], ...], tuple[Array, ...]]:
     """`atrous_level` on planes: S colours of three, S variances; `slope` is grad z."""
     dtype = guides.depth.dtype
     lumas = tuple(luminance_of_planes(*color) for color in colors)
-    prefiltered = prefilter_variance(variances, guides.surface, strip_rows=strip_rows)
+    prefiltered = prefilter_variance(variances, guides.surface, strip_rows=strip_rows) if prefilter else variances
     scales = tuple(
         luminance_scale(v, sigma_luminance=scalars.sigma_luminance, luminance_epsilon=scalars.luminance_epsilon)
         for v in prefiltered

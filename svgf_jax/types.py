@@ -220,6 +220,7 @@ class Config(NamedTuple):
         taa: temporal anti-aliasing of the image, after everything else.
         outlier_radius: clamp this frame's illumination to mean +- outlier_sigma standard deviations of the neighbours in
             a window of this radius (3 = 7 x 7) before anything reads it; 0 = do not.
+        prefilter: blur the variance (3 x 3 Gaussian) before it scales the luminance edge-stopping of an a-trous level.
     """
 
     levels: int = 5
@@ -233,6 +234,7 @@ class Config(NamedTuple):
     clamp_radius: int = 0
     taa: bool = False
     outlier_radius: int = 0
+    prefilter: bool = True
 
 
 CHOICES: dict[str, range | tuple] = {
@@ -247,6 +249,7 @@ CHOICES: dict[str, range | tuple] = {
     "clamp_radius": range(13),
     "taa": (False, True),
     "outlier_radius": range(13),
+    "prefilter": (True, False),
 }
 """What each field of `Config` may be."""
 

@@ -11,7 +11,7 @@ history: illumination [S, H, W, 3], moments [S, H, W, 2], history_length [H, W],
 output:  image [H, W, 3], illumination [S, H, W, 3], variance [S, H, W], variance_filtered [S, H, W],
          history_length [H, W], valid [H, W] (reprojection found history), rejected (dict of counts)
 params:  the names of `PAPER`; each a number or a list with one number per a-trous level
-config:  levels, feedback_level; and, where not the paper's: variance, reprojection, fallback, id_test, warm_up, clamp_radius
+config:  levels, feedback_level; where not the paper's: variance, prefilter, reprojection, fallback, id_test, warm_up, clamp_radius
 """
 
 from math import exp, floor, isfinite, sqrt
@@ -320,7 +320,7 @@ def blur_variance(variance, surface):
     return out
 
 
-def atrous_level(illumination, variance, depth, normal, surface, gradient, level, params):
+def atrous_level(illumination, variance, depth, normal, surface, gradient, level, params, prefilter=True):
     """One level of the a-trous filter: C' [S, H, W, 3] and V' [S, H, W]."""
     signals, height, width, _ = illumination.shape
     step = 2**level
@@ -334,7 +334,7 @@ def atrous_level(illumination, variance, depth, normal, surface, gradient, level
 
     color, v = illumination.tolist(), variance.tolist()
     light = luminance(np.moveaxis(illumination, -1, 0)).tolist()
-    blurred = [blur_variance(v[s], surface) for s in range(signals)]
+    blurred = [blur_variance(v[s], surface) if prefilter else v[s] for s in range(signals)]
     out, out_variance = illumination.copy(), variance.copy()
     for y in range(height):
         for x in range(width):
@@ -383,13 +383,13 @@ def step(history, frame, params, config):
     taps = reproject_taps(frame, usable_motion, history, params, config)
     illumination, moments, length, valid = accumulate(illumination, taps, history, surface, params, config)
     gradient = depth_gradient(depth, frame["object_id"].tolist())
-    estimator = config.get("variance", "svgf")
+    estimator, prefilter = config.get("variance", "svgf"), config.get("prefilter", True)
     variance = estimate_variance(moments, length, depth, normal, surface, gradient, params, estimator)
 
     filtered, variance_filtered, feedback = illumination, variance, illumination
     for level in range(config["levels"]):
         filtered, variance_filtered = atrous_level(
-            filtered, variance_filtered, depth, normal, surface, gradient, level, params
+            filtered, variance_filtered, depth, normal, surface, gradient, level, params, prefilter
         )
         if level <= config["feedback_level"]:
             feedback = filtered

@@ -220,6 +220,10 @@ MUTANTS = {
         "atrous", "prefiltered = prefilter_variance(variances, guides.surface, strip_rows=strip_rows)",
         "prefiltered = variances", "test_atrous_level", 0,
     ),
+    "variance blurred though not asked for": mutant(
+        "atrous", "strip_rows=strip_rows) if prefilter else variances", "strip_rows=strip_rows)",
+        "test_atrous_level_without_prefilter",
+    ),
     "blurred variance handed on": mutant(
         "atrous", "\"variance\": variances, \"luma\"", "\"variance\": prefiltered, \"luma\"", "test_atrous_level", 0
     ),

@@ -52,7 +52,7 @@ SYNTHETIC = {
         lambda: scenes.synthetic(18, 13, 17, frames=4, dirty=True),
         oracle.PAPER | {"clamp_sigma": 0.7},
         {"levels": 1, "feedback_level": 0, "clamp_radius": 3}
-        | {"reprojection": "nearest", "fallback": False, "id_test": False, "warm_up": False},
+        | {"reprojection": "nearest", "fallback": False, "id_test": False, "warm_up": False, "prefilter": False},
     ),
     "no levels": (lambda: scenes.synthetic(16, 13, 17, frames=5), oracle.PAPER, {"levels": 0, "feedback_level": 0}),
     "rows that do not divide into strips": (

@@ -263,6 +263,20 @@ def test_atrous_level(level):
     assert_close(values, expected_values)
 
 
+def test_atrous_level_without_prefilter():
+    c = case()
+    light, values = compiled(
+        *(atrous.atrous_level, c.accumulated, c.variance, c.frame),
+        **{"level": 1, "params": c.params, "prefilter": False, "strip_rows": 4},
+    )
+    expected = oracle.atrous_level(
+        *(c.accumulated, c.variance, c.depth, c.normal, c.surface, c.gradient, 1, PARAMS), prefilter=False
+    )
+    assert np.abs(expected[0] - c.level(1)[0]).max() > 0.01
+    assert_close(light, expected[0])
+    assert_close(values, expected[1])
+
+
 @pytest.mark.parametrize("feedback_level", [-1, 0, 1, 9])
 def test_feedback(feedback_level):
     """Two levels, and the history is the output of the level that was asked for."""
