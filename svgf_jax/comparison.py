@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from svgf_jax.exr_layout import PathName
-from svgf_jax.metrics import Scores, score
+from svgf_jax.metrics import Scores, score_frames
 from svgf_jax.references import NAMES, read_radiance
 from svgf_jax.sequences import find_sequence, format_range
 from svgf_jax.threads import read_ahead
@@ -53,12 +53,13 @@ def compare_sequences(
             )
         return image, wanted
 
-    previous = None
-    for number, pair in zip(common, read_ahead(read, common, threads=1), strict=True):
-        if previous is not None and previous[0].shape != pair[0].shape:
-            previous = None
-        for image, where in zip(pair, ("", " in the reference"), strict=True):
-            if bad := int((~np.isfinite(image)).any(-1).sum()):
-                warn(f"frame {number}: {bad} pixel{'s' * (bad != 1)} not finite{where}")
-        yield number, score(*pair, previous=previous, with_flip=with_flip)
-        previous = pair
+    def checked() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for number, pair in zip(common, read_ahead(read, common, threads=1), strict=True):
+            for image, where in zip(pair, ("", " in the reference"), strict=True):
+                if bad := int((~np.isfinite(image)).any(-1).sum()):
+                    warn(f"frame {number}: {bad} pixel{'s' * (bad != 1)} not finite{where}")
+            yield pair
+
+    for number, scores in zip(common, score_frames(checked(), with_flip=with_flip), strict=True):
+        assert scores is not None  # every pair has its reference
+        yield number, scores

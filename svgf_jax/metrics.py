@@ -6,7 +6,7 @@ runs over pixels and channels alike. A nan in an image makes its scores nan, and
 """
 
 import importlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -124,6 +124,25 @@ def score(
         temporal=float("nan") if previous is None else temporal_error(image, previous[0], reference, previous[1]),
         flip=flip(image, reference) if with_flip else float("nan"),
     )
+
+
+def score_frames(
+    pairs: Iterable[tuple[np.ndarray, np.ndarray | None]], *, with_flip: bool = False
+) -> Iterator[Scores | None]:
+    """The scores of consecutive frames (image, reference), one by one; None for a frame without a reference.
+
+    A frame has a temporal error where the one before it has a reference, and their size is the same.
+    """
+    previous = None
+    for image, reference in pairs:
+        if reference is None:
+            previous = None
+            yield None
+            continue
+        if previous is not None and previous[0].shape != image.shape:
+            previous = None
+        yield score(image, reference, previous=previous, with_flip=with_flip)
+        previous = image, reference
 
 
 def mean_scores(scores: Iterable[Scores]) -> Scores:

@@ -7,7 +7,8 @@ import numpy as np
 from svgf_jax import exr
 from svgf_jax.exr_layout import PathName
 from svgf_jax.roles import resolve_roles
-from svgf_jax.sequences import find_sequence
+from svgf_jax.sequences import Sequence, find_sequence, format_range
+from svgf_jax.types import SvgfError
 
 NAMES = ("ref", "reference", "frame")
 """What the sequence of references in a folder may be called, the most likely first."""
@@ -27,6 +28,46 @@ def read_radiance(path: PathName, *, max_pixels: int = exr.MAX_PIXELS) -> np.nda
         if role in roles.layers:
             total += np.stack([image.channels[name].astype(np.float32) for name in roles.layers[role].channels], -1)
     return total
+
+
+def pair_references(
+    frames: Sequence, pattern: PathName, *, prefer: tuple[str, ...] = NAMES
+) -> tuple[dict[int, str], tuple[str, ...]]:
+    """The references of a sequence's frames by number, and what to tell of frames that have none. No pixel is read.
+
+    Args:
+        frames: the sequence.
+        pattern: the references: a folder, a pattern or a file.
+        prefer: which sequence of a folder to take.
+
+    Raises SvgfError: not found, no frame in common.
+    """
+    wanted = find_sequence(pattern, missing="reset", prefer=prefer)
+    there = {number: path for number, path in wanted.files if path is not None}
+    numbers = [number for number, _ in frames.files]
+    paths = {number: there[number] for number in numbers if number in there}
+    if not paths:
+        raise SvgfError(
+            f"{wanted.name} (frames {format_range(there)}) has none of the frames {format_range(numbers)} of "
+            f"{frames.name}; wanted the same frame numbers in both."
+        )
+    missing = [number for number in numbers if number not in paths]
+    told = (
+        f"{wanted.name} lacks frames {format_range(missing)} of {frames.name}: the filter runs through them, "
+        "and they count for nothing."
+    )
+    return paths, (told,) * bool(missing)
+
+
+def read_reference(path: PathName, *, size: tuple[int, ...], number: int) -> np.ndarray:
+    """`read_radiance` of the reference of the frame `number`, which is of `size` (height, width); else SvgfError."""
+    image = read_radiance(path)
+    if image.shape[:2] != size:
+        raise SvgfError(
+            f"{path} is {image.shape[1]} x {image.shape[0]} pixels, the noisy frame {number} {size[1]} x {size[0]}; "
+            "wanted references of the same size. Render them anew, or crop both alike."
+        )
+    return image
 
 
 def load_reference(pattern: PathName, *, frames: str | None = None) -> np.ndarray:

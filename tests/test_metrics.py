@@ -138,3 +138,16 @@ def test_published_scores_of_the_noisy_sequences(data, sequence, psnr, temporal)
     mean = metrics.mean_scores(scores)
     assert mean.psnr == pytest.approx(psnr, abs=0.01)
     assert mean.temporal == pytest.approx(temporal, abs=1e-4)
+
+
+def test_frames_are_scored_in_turn():
+    """As `score` does; a frame without a reference, or of another size, is one that no change is measured from."""
+    rng = np.random.default_rng(0)
+    images = [rng.random((size, 12, 3)) for size in (12, 12, 12, 12, 13)]
+    targets = [rng.random(image.shape) for image in images]
+    found = list(metrics.score_frames(zip(images, [*targets[:2], None, *targets[3:]], strict=True)))
+    assert found[1] == metrics.score(images[1], targets[1], previous=(images[0], targets[0]))._replace(
+        flip=found[1].flip
+    )
+    assert found[2] is None
+    assert [math.isnan(found[i].temporal) for i in (0, 1, 3, 4)] == [True, False, True, True]

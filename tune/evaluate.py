@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from svgf_jax import Config, Params, init, step
-from svgf_jax.metrics import Scores, mean_scores, score
+from svgf_jax.metrics import Scores, mean_scores, score_frames
 from svgf_jax.threads import read_ahead
 from tune.shots import Shot
 
@@ -24,14 +24,8 @@ class Measured(NamedTuple):
 
 def measure(shot: Shot, params: Params, config: Config, *, with_flip: bool = False) -> Measured:
     """Denoise a shot whose targets are references, and score it. One frame in memory at a time."""
-    scores: list[Scores] = []
-    previous = None
-    for image, target in filtered(shot, params, config):
-        if target is None:
-            previous = None
-            continue
-        scores.append(score(image, target, previous=previous, with_flip=with_flip))
-        previous = (image, target)
+    found = score_frames(filtered(shot, params, config), with_flip=with_flip)
+    scores = [score for score in found if score is not None]
     return Measured(shot.name, tuple(scores), mean_scores(scores))
 
 

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from svgf_jax import Frame, SvgfError, open_source, read_frame, read_radiance
-from svgf_jax.sequences import find_sequence, format_range
+from svgf_jax import Frame, SvgfError, open_source, read_frame
+from svgf_jax.references import pair_references, read_reference
 
 
 class Example(NamedTuple):
@@ -69,37 +69,17 @@ def shot_of_files(
         SvgfError: not found, no frame in common.
     """
     source = open_source(noisy, frames=frames, **options)
-    wanted = find_sequence(target, missing="reset", prefer=tuple(prefer))
-    paths = {number: path for number, path in wanted.files if path is not None}
+    paths, lacking = pair_references(source.sequence, target, prefer=tuple(prefer))
     numbers = [number for number, _ in source.sequence.files]
-    missing = [number for number in numbers if number not in paths]
-    if len(missing) == len(numbers):
-        raise SvgfError(
-            f"{wanted.name} (frames {format_range(paths)}) has none of the frames {format_range(numbers)} of "
-            f"{source.sequence.name}; wanted the same frame numbers in both."
-        )
-    notes = list(source.warnings)
-    if missing:
-        notes.append(
-            f"{wanted.name} lacks frames {format_range(missing)} of {source.sequence.name}: the filter runs through them, "
-            "and they count for nothing."
-        )
 
     def read(index: int) -> Example:
         frame = read_frame(source, index).frame
         path = paths.get(numbers[index])
         if path is None:
             return Example(frame, None)
-        image = read_radiance(path)
-        if image.shape != frame.emission.shape:
-            got, want = image.shape, frame.emission.shape
-            raise SvgfError(
-                f"{path} is {got[1]} x {got[0]} pixels, the noisy frame {numbers[index]} {want[1]} x {want[0]}; "
-                "wanted references of the same size. Render them anew, or crop both alike."
-            )
-        return Example(frame, image)
+        return Example(frame, read_reference(path, size=frame.depth.shape, number=numbers[index]))
 
-    return Shot(str(noisy), len(numbers), read, tuple(notes))
+    return Shot(str(noisy), len(numbers), read, (*source.warnings, *lacking))
 
 
 def window(shot: Shot, *, rows: slice = slice(None), columns: slice = slice(None), frames: slice = slice(None)) -> Shot:
