@@ -23,6 +23,7 @@ app = App(
 )
 app.command("svgf_jax.commands.denoise:denoise", help="Denoise a sequence of EXR files into a folder.")
 app.command("svgf_jax.commands.compare:compare", help="Measure a sequence against its reference.")
+app.command("svgf_jax.commands.ablate:ablate", help="Measure what each part of the filter is worth.")
 app.command("svgf_jax.commands.demo:demo", help="Denoise the bundled sample and measure the result.")
 app.command("svgf_jax.commands.video:video", help="Show sequences side by side as a video.")
 params = App(name="params", help="Show presets and parameters.", help_format="plaintext")

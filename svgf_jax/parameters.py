@@ -86,7 +86,7 @@ def preset(name: str) -> tuple[Params, Config]:
     paper's filter with numbers fitted to one-sample path tracing), or `adaptive`, which follows changes of the light.
     """
     if name not in PRESETS:
-        raise SvgfError(f"no preset {name!r}; there are {', '.join(PRESETS)}{_suggest(name, PRESETS)}")
+        raise SvgfError(f"no preset {name!r}; there are {', '.join(PRESETS)}{suggest(name, PRESETS)}")
     params, config = PRESETS[name]
     per_level = {key: _per_level(list(value)) for key, value in params._asdict().items() if isinstance(value, tuple)}
     return params._replace(**per_level), config
@@ -106,7 +106,7 @@ def load_params(path: str | os.PathLike[str]) -> tuple[Params, Config]:
 
     known = {"preset", "params", "config", "provenance"}
     for key in content.keys() - known:
-        raise SvgfError(f"{file}: unknown key {key!r}; wanted {', '.join(sorted(known))}{_suggest(key, known)}")
+        raise SvgfError(f"{file}: unknown key {key!r}; wanted {', '.join(sorted(known))}{suggest(key, known)}")
     for table in known - {"preset"}:
         if not isinstance(content.get(table, {}), dict):
             raise SvgfError(f"{file}: {table} is {content[table]!r}; wanted a table, [{table}]")
@@ -149,7 +149,7 @@ def override(params: Params, config: Config, values: Mapping[str, Any]) -> tuple
     names = (*Params._fields, *Config._fields)
     for name in values:
         if name not in names:
-            raise SvgfError(f"no parameter {name!r}; there are {', '.join(names)}{_suggest(name, names)}")
+            raise SvgfError(f"no parameter {name!r}; there are {', '.join(names)}{suggest(name, names)}")
     config = config._replace(**{k: _choice(k, v) for k, v in values.items() if k in Config._fields})
     given = {k: _number(k, v, config.levels) for k, v in values.items() if k in Params._fields}
     params = params._replace(**given)
@@ -193,6 +193,7 @@ def _plain(value: Any) -> Any:
     return [float(v) for v in value] if isinstance(value, list | tuple) else float(value)
 
 
-def _suggest(name: Any, known: Any) -> str:
+def suggest(name: Any, known: Any) -> str:
+    """The end of an error message about an unknown name: the most similar one that is known, if any is."""
     close = difflib.get_close_matches(str(name), list(known), n=1)
     return f". Did you mean {close[0]}?" if close else ""

@@ -50,7 +50,7 @@ def observed(*arguments, cwd=None):
 # Answers at once
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["denoise", "--help"], ["compare", "--help"], ["--version"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["denoise", "--help"], ["ablate", "--help"], ["--version"]])
 def test_help_is_quick_and_imports_nothing_heavy(arguments):
     runs = [observed(*arguments) for _ in range(3)]
     assert [code for code, *_ in runs] == [0, 0, 0]

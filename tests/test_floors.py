@@ -27,7 +27,7 @@ FLOORS = [
     {"frames", "references", "pipeline", "checkpoint"},
     {"baselines", "comparison", "film", "outputs", "plan"},
     {"compiled"},
-    {"streaming"},
+    {"ablation", "streaming"},
     {"demo"},
     {"commands"},
     {"cli"},

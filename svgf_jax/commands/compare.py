@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from svgf_jax import atomic
-from svgf_jax.commands import terminal
-from svgf_jax.types import SvgfError
+from svgf_jax.commands import results, terminal
 
 if TYPE_CHECKING:
     from svgf_jax.metrics import Scores
@@ -54,11 +52,7 @@ def compare(
     from svgf_jax import metrics
     from svgf_jax.comparison import compare_sequences
 
-    for path in (json_file, csv_file):
-        if path is not None and path.exists() and not overwrite:
-            raise SvgfError(f"{path} exists already; choose another name, or --overwrite.")
-        if path is not None:
-            _save(path, None)
+    results.require_writable((json_file, csv_file), overwrite=overwrite)
     if flip:
         metrics.require_flip()
     pairs = compare_sequences(out, reference, frames=frames, with_flip=flip, warn=lambda text: terminal.warn([text]))
@@ -67,9 +61,11 @@ def compare(
     print_scores("frame", scores | {"mean": mean})
     if json_file is not None:
         rows = [{"frame": int(number), **score._asdict()} for number, score in scores.items()]
-        _save(json_file, terminal.to_json({"out": out, "reference": reference, "frames": rows, "mean": mean}) + "\n")
+        results.save(
+            json_file, terminal.to_json({"out": out, "reference": reference, "frames": rows, "mean": mean}) + "\n"
+        )
     if csv_file is not None:
-        _save(csv_file, _to_csv(scores | {"mean": mean}))
+        results.save(csv_file, _to_csv(scores | {"mean": mean}))
 
 
 def print_scores(title: str, rows: Mapping[str, "Scores"]) -> None:
@@ -110,16 +106,3 @@ def _cells(rows: Mapping[str, "Scores"], show: Callable[[str, float], str]) -> d
         label: {name: "" if none[i, k] else show(name, float(score[k])) for k, name in enumerate(score._fields)}
         for i, (label, score) in enumerate(rows.items())
     }
-
-
-def _save(path: Path, text: str | None) -> None:
-    """Write a file, complete or not at all; None only asks whether that could be done."""
-    try:
-        if text is None:
-            atomic.require_writable(path)
-        else:
-            atomic.write_text(path, text)
-    except OSError as error:
-        raise SvgfError(
-            f"Could not write {path}: {error.strerror or error}. Choose a folder that is writable."
-        ) from error

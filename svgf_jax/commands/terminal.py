@@ -57,21 +57,23 @@ def to_json(value: Any) -> str:
 @contextmanager
 def progress(total: int) -> Iterator[Callable[["FrameReport"], None]]:
     """A function to call with each frame's report: a bar with frames/s and time left; off a terminal a line a frame."""
-    with _bar(total) if sys.stderr.isatty() else _lines(total) as on_frame:
+    with bar(total) as advance:
+
+        def on_frame(report: "FrameReport") -> None:
+            advance(f"frame {report.number}")
+            if not sys.stderr.isatty():
+                where = "" if report.path is None else f" -> {report.path}"
+                tell("; ".join([f"frame {report.number}: {report.status}{where}", *repairs(report.counts)]))
+
         yield on_frame
 
 
 @contextmanager
-def _lines(_: int) -> Iterator[Callable[["FrameReport"], None]]:
-    def on_frame(report: "FrameReport") -> None:
-        where = "" if report.path is None else f" -> {report.path}"
-        tell("; ".join([f"frame {report.number}: {report.status}{where}", *repairs(report.counts)]))
-
-    yield on_frame
-
-
-@contextmanager
-def _bar(total: int) -> Iterator[Callable[["FrameReport"], None]]:
+def bar(total: int) -> Iterator[Callable[[str], None]]:
+    """A function to call after each of so many frames, with its name; it moves a bar, or does nothing off a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda name: None
+        return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -83,16 +85,16 @@ def _bar(total: int) -> Iterator[Callable[["FrameReport"], None]]:
         TimeRemainingColumn(),
     )
     began, done = time.monotonic(), 0
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("reading, compiling", total=total, rate="")
+    with Progress(*columns, console=Console(stderr=True)) as shown:
+        task = shown.add_task("reading, compiling", total=total, rate="")
 
-        def on_frame(report: "FrameReport") -> None:
+        def advance(name: str) -> None:
             nonlocal done
             done += 1
             rate = done / max(time.monotonic() - began, 1e-9)
-            bar.update(task, advance=1, description=f"frame {report.number}", rate=f"{rate:.2f} frames/s")
+            shown.update(task, advance=1, description=name, rate=f"{rate:.2f} frames/s")
 
-        yield on_frame
+        yield advance
 
 
 def _plain(value: Any) -> Any:

@@ -1,0 +1,32 @@
+"""Files of results that commands write: complete or not at all, and asked for before the work."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from svgf_jax import atomic
+from svgf_jax.types import SvgfError
+
+
+def require_writable(paths: Iterable[Path | None], *, overwrite: bool) -> None:
+    """Raise SvgfError where a file exists and may not be replaced, or could not be written; None is no file."""
+    for path in paths:
+        if path is None:
+            continue
+        if path.exists() and not overwrite:
+            raise SvgfError(f"{path} exists already; choose another name, or --overwrite.")
+        try:
+            atomic.require_writable(path)
+        except OSError as error:
+            raise _not_written(path, error) from error
+
+
+def save(path: Path, text: str) -> None:
+    """Write a file, or raise SvgfError and leave it as it was."""
+    try:
+        atomic.write_text(path, text)
+    except OSError as error:
+        raise _not_written(path, error) from error
+
+
+def _not_written(path: Path, error: OSError) -> SvgfError:
+    return SvgfError(f"Could not write {path}: {error.strerror or error}. Choose a folder that is writable.")
