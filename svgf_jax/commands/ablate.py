@@ -160,9 +160,9 @@ def _shown(one: "Measured", base: "Measured") -> dict[str, tuple[str, str]]:
 
 
 def _line(one: "Measured", base: "Measured", which: str) -> str:
-    shown = _shown(one, base)
-    cells = (f"{COLUMNS[name][0]} {value}{change and f' ({change})'}" for name, (value, change) in shown.items())
-    return f"{which}: {one.row.name}: {', '.join(cells)}"
+    """A row in less than 80 columns."""
+    psnr, _, temporal, _ = (f"{value}{change and f' ({change})'}" for value, change in _shown(one, base).values())
+    return f"{which}: {one.row.name}: PSNR {psnr}, temporal {temporal or 'none'}"
 
 
 def _print(title: str, found: Sequence["Measured"]) -> None:
