@@ -19,7 +19,8 @@ COMPARED = ("image", "illumination", "variance", "variance_filtered", "history_l
 
 def to_frame(frame, dtype=np.float64) -> Frame:
     with np.errstate(over="ignore"):
-        return Frame(**{k: np.asarray(v, np.int32 if k == "object_id" else dtype) for k, v in frame.items()})
+        given = {k: v for k, v in frame.items() if v is not None}
+        return Frame(**{k: np.asarray(v, np.int32 if k == "object_id" else dtype) for k, v in given.items()})
 
 
 def to_frames(frames, dtype=np.float64) -> Frame:

