@@ -22,7 +22,7 @@ from svgf_jax.accumulation import accumulate, clamp_history
 from svgf_jax.check import check_frame, check_history, check_sequence
 from svgf_jax.color import demodulate
 from svgf_jax.joint_bilateral import bilateral_filter, gaussian_filter, joint_bilateral_filter
-from svgf_jax.methods import Games202Params, MethodConfig, check_method_config
+from svgf_jax.methods import OVER_TIME, Games202Params, MethodConfig, check_method_config
 from svgf_jax.modulation import modulate
 from svgf_jax.pipeline import init
 from svgf_jax.reprojection import reproject
@@ -116,7 +116,8 @@ def one_signal(frame: Frame, *, config: MethodConfig) -> Frame:
 
 def filter_alone(color: Array, frame: Frame, *, params: Any, config: MethodConfig) -> Array:
     """`config.filter` on the color `[1, H, W, 3]` of one frame."""
-    window = {"radius": config.radius, "footprint": config.footprint, "mask": frame.object_id != -1}
+    window = {name: getattr(config, name) for name in ("radius", "footprint", "levels", "last_pass")}
+    window["mask"] = frame.object_id != -1
     if config.filter == "none":
         return color
     if config.filter == "gaussian":
@@ -151,5 +152,5 @@ def as_svgf(params: Any, config: MethodConfig) -> tuple[Params, Config]:
         reproject_depth=jnp.inf,
         reproject_normal=-2.0,
     )
-    shared = {name: getattr(config, name) for name in MethodConfig._fields if name in Config._fields}
+    shared = {name: getattr(config, name) for name in OVER_TIME}
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, params.alpha.dtype), numbers), Config(**shared)

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from svgf_jax.types import CHOICES, Config, Params, SvgfError, choices_of, is_choice
+from svgf_jax.types import CHOICES, Config, Params, SvgfError, bounds_of, choices_of, is_choice
 
 
 class GaussianParams(NamedTuple):
@@ -58,6 +58,7 @@ class MethodConfig(NamedTuple):
         filter: "none", "gaussian", "bilateral" or "joint-bilateral", for each frame alone.
         radius: of its window, in pixels.
         footprint: how the window is covered: "full", "separable" or "atrous" (see `svgf_jax.joint_bilateral`).
+        levels, last_pass: of "atrous": its passes, None = as many as the radius asks for, and whether 3 x 3 taps follow.
         temporal: whether frames are reprojected and accumulated after that.
         reprojection, fallback, id_test, warm_up, clamp_radius: as in `Config`; read only with `temporal`.
         demodulate: filter the radiance over the albedo instead of the beauty; emission is then left alone.
@@ -66,6 +67,8 @@ class MethodConfig(NamedTuple):
     filter: str = "joint-bilateral"
     radius: int = 16
     footprint: str = "full"
+    levels: int | None = None
+    last_pass: bool = False
     temporal: bool = True
     reprojection: str = "nearest"
     fallback: bool = False
@@ -84,8 +87,8 @@ class Method(NamedTuple):
     choices: tuple[str, ...]
 
 
-_WINDOW = ("radius", "footprint", "demodulate")
-_TIME = ("reprojection", "fallback", "id_test", "warm_up", "clamp_radius")
+_WINDOW = ("radius", "footprint", "levels", "last_pass", "demodulate")
+OVER_TIME = ("reprojection", "fallback", "id_test", "warm_up", "clamp_radius")
 _FRAME = MethodConfig(temporal=False)
 
 METHODS: dict[str, Method] = {
@@ -93,19 +96,19 @@ METHODS: dict[str, Method] = {
         "joint bilateral filter, then project and accumulate: GAMES202's homework 5",
         Games202Params(),
         MethodConfig(),
-        (*_WINDOW, *_TIME),
+        (*_WINDOW, *OVER_TIME),
     ),
     "games202-atrous": Method(
         "the same with the filter in a-trous passes",
         Games202Params(),
         MethodConfig(footprint="atrous"),
-        (*_WINDOW, *_TIME),
+        (*_WINDOW, *OVER_TIME),
     ),
     "accumulate": Method(
         "project and accumulate only",
         AccumulateParams(),
         MethodConfig(filter="none", radius=0),
-        ("demodulate", *_TIME),
+        ("demodulate", *OVER_TIME),
     ),
     "joint-bilateral": Method(
         "filter only, guided by color, normals and planes", JointBilateralParams(), _FRAME, _WINDOW
@@ -126,9 +129,11 @@ METHOD_CHOICES: dict[str, range | tuple] = {
     "filter": ("none", "gaussian", "bilateral", "joint-bilateral"),
     "radius": range(129),
     "footprint": ("full", "separable", "atrous"),
+    "levels": (None, *range(9)),
+    "last_pass": (False, True),
     "temporal": (True, False),
     "demodulate": (True, False),
-    **{name: CHOICES[name] for name in _TIME},
+    **{name: CHOICES[name] for name in OVER_TIME},
 }
 """What each field of `MethodConfig` may be."""
 
@@ -181,7 +186,7 @@ def override_method(name: str, values: Mapping[str, Any]) -> tuple[Any, MethodCo
             least, most = BOUNDS[key]
             number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
             if not (number and least <= value <= most):
-                raise SvgfError(f"{key} = {value!r}; wanted a number from {least:g} to {most:g}")
+                raise SvgfError(f"{key} = {value!r}; wanted {bounds_of(least, most)}")
             params = params._replace(**{key: float(value)})
         else:
             config = config._replace(**{key: value})
@@ -194,3 +199,8 @@ def check_method_config(config: MethodConfig) -> None:
     for key, value in config._asdict().items():
         if not is_choice(key, value, choices=METHOD_CHOICES):
             raise SvgfError(f"{key} is {value!r}; wanted {choices_of(key, choices=METHOD_CHOICES)}")
+    if config.footprint != "atrous" and (config.levels is not None or config.last_pass):
+        raise SvgfError(
+            f"levels and last_pass are of the footprint atrous; got levels = {config.levels}, last_pass = {config.last_pass} "
+            f"with footprint = {config.footprint}. Leave them out, or set footprint=atrous."
+        )

@@ -25,7 +25,7 @@ from typing import Any
 import tomli_w
 
 from svgf_jax import atomic
-from svgf_jax.types import Config, Params, SvgfError, choices_of, is_choice
+from svgf_jax.types import Config, Params, SvgfError, bounds_of, choices_of, is_choice
 
 PRESETS: dict[str, tuple[Params, Config]] = {
     "paper": (Params(), Config()),
@@ -177,7 +177,7 @@ def _number(name: str, value: Any, levels: int) -> Any:
             or not least <= entry <= most
             or math.isinf(entry)
         ):
-            raise SvgfError(f"{name} = {entry!r}; wanted a number from {least:g} to {most:g}")
+            raise SvgfError(f"{name} = {entry!r}; wanted {bounds_of(least, most)}")
     return _per_level(entries) if per_level else float(value)
 
 

@@ -23,6 +23,7 @@ Conventions, stated here once:
 | `variance`    | `[S, H, W]` or None    | measured variance of the pixel's mean, of the radiance's luminance; < 0 = unknown |
 """
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -282,6 +283,11 @@ def choices_of(name: str, *, choices: Mapping[str, range | tuple] = CHOICES) -> 
     if isinstance(values, range):
         return f"a whole number from {values[0]} to {values[-1]}"
     return " or ".join(str(value).lower() for value in values)
+
+
+def bounds_of(least: float, most: float) -> str:
+    """A range of numbers in words; infinity is not a number."""
+    return f"a number >= {least:g}" if math.isinf(most) else f"a number from {least:g} to {most:g}"
 
 
 def at_level(params: Params, level: int) -> Params:

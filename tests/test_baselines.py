@@ -12,9 +12,10 @@ import scenes
 from bridge import QUICK, to_frame
 
 from svgf_jax import SvgfError, exr, streaming
-from svgf_jax.baselines import baseline_denoise, baseline_init, baseline_step
+from svgf_jax.baselines import baseline_denoise, baseline_init, baseline_step, filter_alone, one_signal
 from svgf_jax.commands import denoise, settings
 from svgf_jax.frames import load_sequence, open_source
+from svgf_jax.joint_bilateral import gaussian_filter
 from svgf_jax.methods import METHODS, method
 from svgf_jax.outputs import WriteOptions
 
@@ -220,11 +221,15 @@ def test_the_command_knows_every_method():
     [
         (("gaussian", ["sigma_normal=1"]), "method gaussian has no 'sigma_normal' .it belongs to svgf, games202"),
         (("svgf", ["sigma_plane=1"]), "method svgf has no 'sigma_plane' .it belongs to games202"),
-        (("games202", ["levels=3"]), "belongs to svgf"),
+        (("games202", ["max_history=3"]), "belongs to svgf"),
+        (("games202", ["levels=3"]), "levels and last_pass are of the footprint atrous"),
+        (("bilateral", ["footprint=separable", "last_pass=true"]), "levels and last_pass are of the footprint atrous"),
+        (("games202-atrous", ["levels=9"]), "wanted none or 0 or 1"),
         (("games202", ["sigma_colour=3"]), "did you mean sigma_color"),
         (("games202", ["temporal=false"]), "has no 'temporal'"),
         (("games202", ["alpha=3"]), "wanted a number from 0 to 1"),
-        (("games202", ["sigma_color=1,2"]), "wanted a number from 0"),
+        (("games202", ["sigma_color=1,2"]), "wanted a number >= 0$"),
+        (("games202", ["sigma_color=abc"]), "wanted a number.$"),
         (("games202", ["radius=-1"]), "wanted a whole number from 0 to 128"),
         (("games202", ["footprint=round"]), "wanted full or separable or atrous"),
         (("svgf", ["fallback=maybe"]), "wanted true or false"),
@@ -234,6 +239,19 @@ def test_what_a_method_does_not_have_is_told(arguments, complaint):
     name, changes = arguments
     with pytest.raises(SvgfError, match=complaint):
         settings.choose_method(name, None, None, changes)
+
+
+def test_the_passes_of_atrous_are_set_by_name():
+    """And arrive in the filter."""
+    frame = one_signal(to_frame(moving()[0], np.float64), config=method("gaussian")[1])
+    for passes in ({}, {"levels": 1}, {"levels": 2, "last_pass": True}, {"levels": None, "last_pass": False}):
+        changes = [f"{name}={str(value).lower()}" for name, value in passes.items()]
+        _, params, config = settings.choose_method("gaussian", None, None, ["footprint=atrous", "radius=3", *changes])
+        got = filter_alone(frame.radiance, frame, params=params, config=config)[0]
+        options = {"sigma": params.sigma_space, "radius": 3, "footprint": "atrous", "mask": frame.object_id != -1}
+        np.testing.assert_array_equal(got, gaussian_filter(frame.radiance[0], **options, **passes))
+    _, _, config = settings.choose_method("joint-bilateral-atrous", None, None, ["levels=3", "last_pass=true"])
+    assert (config.levels, config.last_pass) == (3, True)
 
 
 def test_presets_belong_to_svgf():

@@ -38,7 +38,7 @@ def choose_method(
             )
     texts = assignments(changes, option="--set", example="sigma_color=0.3")
     check_settable(method, texts)
-    values = {key: _value(key, text, METHOD_CHOICES) for key, text in texts.items()}
+    values = {key: _value(key, text, METHOD_CHOICES, per_level=False) for key, text in texts.items()}
     return " ".join([method, *(f"{key}={text}" for key, text in texts.items())]), *override_method(method, values)
 
 
@@ -60,7 +60,7 @@ def _split(text: str, *, option: str, example: str) -> tuple[str, str]:
     return key, value
 
 
-def _value(key: str, text: str, choices: Mapping[str, range | tuple] = CHOICES) -> Any:
+def _value(key: str, text: str, choices: Mapping[str, range | tuple] = CHOICES, *, per_level: bool = True) -> Any:
     """A number, or a comma list of one per a-trous level; for a choice one of its values."""
     if key in choices:
         named = {str(value).lower(): value for value in choices[key]}
@@ -70,6 +70,6 @@ def _value(key: str, text: str, choices: Mapping[str, range | tuple] = CHOICES) 
     try:
         values = [float(item) for item in text.split(",")]
     except ValueError as error:
-        wanted = f"a number, or one per a-trous level: {key}=4,3,2,1,1"
+        wanted = "a number" + (f", or one per a-trous level: {key}=4,3,2,1,1" if per_level else "")
         raise SvgfError(f"Got --set {key}={text}; wanted {wanted}.") from error
     return values[0] if len(values) == 1 else values
