@@ -117,7 +117,7 @@ def write_png(path: str | Path, picture: np.ndarray) -> None:
 
 
 def write_video(path: str | Path, pictures: Iterable[np.ndarray], *, fps: float = 24.0) -> None:
-    """Write `[H, W, 3]` uint8 pictures of one size as an MP4 (H.264, BT.709), under a temporary name and then renamed.
+    """Write `[H, W, 3]` uint8 pictures of one size as an MP4 (H.264, BT.709, sRGB curve), under a temporary name, then renamed.
 
     Holds one picture at a time. An odd width or height, which H.264 cannot store, is filled up by repeating the last
     row or column. Needs the extra `video` (PyAV); `SvgfError` without it, and where writing fails.
@@ -134,7 +134,8 @@ def write_video(path: str | Path, pictures: Iterable[np.ndarray], *, fps: float 
                     stream = container.add_stream("libx264", rate=rate, options={"crf": "16"})
                     stream.height, stream.width, stream.pix_fmt = *even.shape[:2], "yuv420p"
                     coding = stream.codec_context  # 1 = BT.709, and the range of television
-                    coding.colorspace = coding.color_primaries = coding.color_trc = coding.color_range = 1
+                    coding.colorspace = coding.color_primaries = coding.color_range = 1
+                    coding.color_trc = 13  # the curve of IEC 61966-2-1, which `to_8bit` applies
                 frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
                 container.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace="ITU709")))
             if stream is None:

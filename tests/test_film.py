@@ -41,7 +41,7 @@ def test_an_mp4_decodes_to_what_went_in(shots, tmp_path):
         assert float(stream.average_rate) == pytest.approx(30000 / 1001, rel=1e-6)
         assert context.pix_fmt == "yuv420p"
         tags = (context.colorspace, context.color_primaries, context.color_trc, context.color_range)
-        assert tuple(map(int, tags)) == (1, 1, 1, 1)  # BT.709 throughout, limited range
+        assert tuple(map(int, tags)) == (1, 1, 13, 1)  # BT.709 with the sRGB curve, limited range
         frames = list(container.decode(stream))
     times = np.array([float(frame.pts * frame.time_base) for frame in frames])
     np.testing.assert_allclose(np.diff(times), 1001 / 30000, rtol=1e-3)
