@@ -70,7 +70,11 @@ NO_DEMODULATION = Row(
 )
 ONE_SIGNAL = Row("one-signal", {}, "direct and indirect light added up before the filter", _summed)
 ROWS = (
-    Row("unfiltered", {"levels": 0, "alpha": 1.0}, "the noisy frames as they are"),
+    Row(
+        "unfiltered",
+        {"levels": 0, "alpha": 1.0, "taa": False, "outlier_radius": 0, "light_cell": 0},
+        "the noisy frames as they are",
+    ),
     # Signals
     NO_DEMODULATION,
     ONE_SIGNAL,

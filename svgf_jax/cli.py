@@ -1,8 +1,7 @@
 """The `svgf-jax` command line: which commands there are, and what becomes of errors.
 
-cyclopts, because it makes commands out of typed, documented functions, loads them only when they are called, and costs
-0.1 s; argparse would need every flag declared twice. Nothing here or in `commands` imports JAX, NumPy or rich at the
-top: help and errors answer at once.
+cyclopts, because it makes commands out of typed, documented functions, and costs 0.1 s; argparse would need every flag
+declared twice. Nothing here or in `commands` imports JAX, NumPy or rich at the top: help and errors answer at once.
 """
 
 import sys
@@ -12,6 +11,12 @@ from typing import NoReturn
 from cyclopts import App, CycloptsError
 
 from svgf_jax import __version__
+from svgf_jax.commands.ablate import ablate
+from svgf_jax.commands.compare import compare
+from svgf_jax.commands.demo import demo
+from svgf_jax.commands.denoise import denoise
+from svgf_jax.commands.params import list_, show
+from svgf_jax.commands.video import video
 from svgf_jax.types import SvgfError
 
 app = App(
@@ -21,14 +26,14 @@ app = App(
     version=__version__,
     help_format="plaintext",
 )
-app.command("svgf_jax.commands.denoise:denoise", help="Denoise a sequence of EXR files into a folder.")
-app.command("svgf_jax.commands.compare:compare", help="Measure a sequence against its reference.")
-app.command("svgf_jax.commands.ablate:ablate", help="Measure what each part of the filter is worth.")
-app.command("svgf_jax.commands.demo:demo", help="Denoise the bundled sample and measure the result.")
-app.command("svgf_jax.commands.video:video", help="Show sequences side by side as a video.")
+app.command(denoise)
+app.command(compare)
+app.command(ablate)
+app.command(demo)
+app.command(video)
 params = App(name="params", help="Show presets and parameters.", help_format="plaintext")
-params.command("svgf_jax.commands.params:list_", name="list", help="List presets and parameters.")
-params.command("svgf_jax.commands.params:show", help="Print parameters as TOML, ready for `denoise --params`.")
+params.command(list_, name="list")
+params.command(show)
 app.command(params)
 
 
@@ -37,7 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
-        fail(f"{str(error).strip()} See `svgf-jax --help`.")
+        called = [name for name in (sys.argv[1:] if arguments is None else arguments)[:1] if name in app]
+        fail(f"{str(error).strip()} See `{' '.join(['svgf-jax', *called, '--help'])}`.")
     except SvgfError as error:
         fail(str(error))
     except KeyboardInterrupt:

@@ -47,7 +47,9 @@ def make_film(
     position = _check(inputs, out, labels, layout, split, scale)
     preview.frame_rate(fps)
     tonemapping.check_exposure(exposure)
-    found = [find_sequence(name, frames=frames, missing="reset", prefer=("frame", "denoised")) for name in inputs]
+    found = [
+        find_sequence(name, frames=frames, missing="reset", prefer=("frame", "denoised", "beauty")) for name in inputs
+    ]
     files = [{number: path for number, path in sequence.files if path is not None} for sequence in found]
     numbers = sorted(set.intersection(*(set(paths) for paths in files)))
     if not numbers:

@@ -90,7 +90,7 @@ def ablate(
     if themselves := {path for _, path in source.sequence.files} & set(references.values()):
         raise SvgfError(f"Got {min(map(str, themselves))} as its own reference; wanted a converged render of it.")
     there = ablation.grid(chosen, config, signals=len(source.roles.signals), albedo="albedo" in source.roles.layers)
-    rows = ablation.choose_rows([] if only is None else only.split(","), there)
+    rows = ablation.choose_rows([] if only is None else [name.strip() for name in only.split(",")], there)
     terminal.warn([*source.warnings, *lacking])
 
     found: list[Measured] = []
