@@ -57,10 +57,6 @@ def test_help_and_errors_answer_without_jax(tmp_path):
         (["noisy", "-o", "t.toml"], "neither --reference nor --second"),
         (["a", "b", "--reference", "r", "-o", "t.toml"], "2 sequences and 1 of --reference"),
         (["a", "--reference", "r", "-o", "nowhere/t.toml"], "no folder"),
-        (
-            ["a", "--reference", "r", "--validate", "a", "--validate-reference", "r", "-o", "t.toml"],
-            "both tuned and validated",
-        ),
         (["a", "--second", "r", "--robust", "huber", "-o", "t.toml"], "biased"),
         (["a", "--reference", "r", "--validate", "v", "-o", "t.toml"], "wanted one for each"),
         (["a", "--reference", "r", "-o", "t.toml"], "no such"),
@@ -137,7 +133,7 @@ def test_the_page_works_in_a_browser(tuned, tmp_path):
     """
     dom = opened(tuned[1] / "report.html", tmp_path, script=script)
     count, drawn, clip = re.search(r"<title>(\d+) of (\d+) (.*?)</title>", dom).groups()
-    assert int(count) == int(drawn) >= 4 + 3  # two sliders of two pictures, the error's map and two slopes'
+    assert int(count) == int(drawn) >= 4 + 3  # two sliders of two pictures, three slopes
     assert clip.startswith("inset(0px 80% 0px 0px")
     assert "<polyline" in dom
 
@@ -159,3 +155,29 @@ def test_worse_validation_can_be_accepted(accept, code, shots, tmp_path, monkeyp
     with pytest.raises(SystemExit) as left:
         main([str(shots), "--reference", str(shots), "-o", str(tmp_path / "t.toml"), *accept])
     assert left.value.code == code
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--validate", "{}/frame_####.exr", "--validate-reference", "{}"], "both tuned and validated"),
+        (["--second", "{}/frame_####.exr"], "independent render"),
+        (["--reference", "{}", "--robust-width", "0"], "above 0"),
+        (["--reference", "{}", "--prior", "-3"], "0 or more"),
+        (["--reference", "{}", "--max-steps", "0"], "at least 1"),
+        (["--reference", "{}", "--resume"], "no checkpoint"),
+        (["--reference", "{}", "--maps", "{}/cameras.json"], "wanted a folder"),
+        (["--reference", "{}", "--report", "t.toml"], "two files"),
+    ],
+)
+def test_what_would_mislead_is_refused(options, said, shots, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (shots / "cameras.json").touch()
+    options = [option.format(shots) for option in options]
+    if "--second" not in options and "--reference" not in options:
+        options += ["--reference", str(shots)]
+    with pytest.raises(SystemExit) as left:
+        main([str(shots), "-o", "t.toml", "--cameras", "none", *options])
+    assert left.value.code == 2
+    assert said in capsys.readouterr().err
+    (shots / "cameras.json").unlink()

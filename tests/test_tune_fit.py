@@ -198,6 +198,19 @@ def test_an_interrupted_fit_returns_the_best_so_far():
     assert fit.params.sigma_luminance == pytest.approx(START.sigma_luminance)
 
 
+def test_interrupted_between_trial_points_it_returns_the_best_so_far():
+    """Ctrl-C is likeliest right after a line has appeared."""
+
+    def interrupt(iteration):
+        if iteration.number == 2:
+            raise KeyboardInterrupt
+
+    fit = tune.fit(START, CONFIG, [shot()], TERMS, names=NAMES, on_iteration=interrupt)
+    assert fit.result.startswith("interrupted")
+    assert len(fit.iterations) == 3
+    assert fit.loss < 1
+
+
 def test_holes_in_the_data_count_for_nothing():
     noisy, target = made()
     radiance = np.array(noisy.radiance)

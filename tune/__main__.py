@@ -28,6 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except SvgfError as error:
         fail(str(error))
     except KeyboardInterrupt:
+        print("svgf-tune: interrupted", file=sys.stderr)
         sys.exit(130)
     sys.exit(code if isinstance(code, int) else 0)
 

@@ -12,7 +12,7 @@ from svgf_jax.atomic import replacing
 from tune.fitting import Iteration, Progress
 from tune.solver import Descent, arrays, restored
 
-FORMAT = 1
+FORMAT = 2
 
 
 def save(path: Path, progress: Progress, identity: dict[str, Any]) -> None:
@@ -24,6 +24,7 @@ def save(path: Path, progress: Progress, identity: dict[str, Any]) -> None:
         "identity": identity,
         "start": progress.start,
         "ended": progress.ended,
+        "endings": progress.endings,
         "states": len(state),
         "found": progress.found is not None,
     }
@@ -70,6 +71,7 @@ def load(path: Path, fresh: Descent, identity: dict[str, Any]) -> Progress:
             found=(content["triangle"], content["scatter"], int(content["rows"])) if header["found"] else None,
             ended=header["ended"],
             pixel_weights=content["pixel_weights"],
+            endings=tuple(header["endings"]),
         )
     except FileNotFoundError:
         raise SvgfError(f"{path}: no checkpoint to resume from; start without --resume") from None

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 Flag = Parameter(negative=(), show_default=False)
 Repeated = Parameter(negative=(), consume_multiple=True, show_default=False)
+SECOND = ("alt", "second", "noisy2")  # what the second render is called in a folder
+MAPS = "sensitivity.exr"  # as `explore.write_maps` calls it
 INPUT, WHAT, HOW, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["Input", "What", "How", "Output"]))
 
 
@@ -103,12 +105,19 @@ def command(
     name, start, config = settings.choose(preset, params, set_)
     checkpoint = out.with_name(f".{out.name}.progress.npz")
     _check(noisy, reference, second, validate, validate_reference, robust)
-    _check_apart(noisy, frames, validate, validate_frames)
-    for path in (out, report):
+    _check_numbers(robust_width, temporal, prior, max_steps, starts, tangent_batch)
+    _check_apart(noisy, frames, validate, validate_frames, second)
+    if report is not None and report.resolve() == out.resolve():
+        raise SvgfError(f"Got {out} for both --out and --report; wanted two files.")
+    for path in (out, report, None if maps is None else maps / MAPS):
         if path is not None and path.exists() and not (overwrite or resume):
             raise SvgfError(f"{path} exists already; choose another name, or --overwrite.")
-        if path is not None and not path.absolute().parent.is_dir():
+        if path in (out, report) and path is not None and not path.absolute().parent.is_dir():
             raise SvgfError(f"{path}: there is no folder {path.absolute().parent}; make it, or choose another name.")
+    if resume and not checkpoint.exists():
+        raise SvgfError(f"{checkpoint}: no checkpoint to resume from; start without --resume.")
+    if maps is not None and maps.exists() and not maps.is_dir():
+        raise SvgfError(f"--maps {maps} is a file; wanted a folder.")
     roles = settings.assignments(channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
     reading: dict[str, Any] = {
         "channel": {role: names.split(",") for role, names in roles.items()},
@@ -129,8 +138,7 @@ def command(
 
     references = [shot_of_files(n, r, frames=frames, **reading) for n, r in zip(noisy, reference, strict=False)]
     seconds = [
-        shot_of_files(n, s, frames=frames, prefer=("alt", "second", "noisy2"), **reading)
-        for n, s in zip(noisy, second, strict=False)
+        shot_of_files(n, s, frames=frames, prefer=SECOND, **reading) for n, s in zip(noisy, second, strict=False)
     ]
     held = [
         shot_of_files(n, r, frames=validate_frames, **reading)
@@ -157,6 +165,9 @@ def command(
         "solver": solver,
         "residuals": [space, temporal, prior, robust, robust_width],
         "seed": seed,
+        "starts": starts,
+        "choices": [str(choice) for choice in config],
+        "reading": [channel, file, cameras],
     }
     terminal.warn(note for shot in (*shots, *held) for note in shot.notes)
     length = sum(shot.length for shot in shots)
@@ -236,18 +247,38 @@ def _check(
         )
 
 
-def _check_apart(noisy: tuple, frames: str | None, validate: tuple, validate_frames: str | None) -> None:
-    """What is validated on must not be tuned on: other sequences, or other frames of the same."""
-    from svgf_jax.sequences import parse_range
+def _check_numbers(
+    robust_width: float, temporal: float, prior: float | None, max_steps: int, starts: int, tangent_batch: int
+) -> None:
+    if not robust_width > 0:
+        raise SvgfError(f"Got --robust-width {robust_width:g}; wanted a number above 0.")
+    for option, weight in (("--temporal", temporal), ("--prior", 0.0 if prior is None else prior)):
+        if not weight >= 0:
+            raise SvgfError(f"Got {option} {weight:g}; wanted a weight of 0 or more.")
+    for option, count in (("--max-steps", max_steps), ("--starts", starts), ("--tangent-batch", tangent_batch)):
+        if count < 1:
+            raise SvgfError(f"Got {option} {count}; wanted at least 1.")
 
-    common = {str(Path(v).resolve()) for v in validate} & {str(Path(n).resolve()) for n in noisy}
-    if common and (
-        frames is None or validate_frames is None or {*parse_range(frames)} & {*parse_range(validate_frames)}
-    ):
-        raise SvgfError(
-            f"{common.pop()} is both tuned and validated on; the validation would say nothing. Take another sequence, "
-            "or other frames of it: --frames 0-7 --validate-frames 8-15."
-        )
+
+def _check_apart(noisy: tuple, frames: str | None, validate: tuple, validate_frames: str | None, second: tuple) -> None:
+    """What is validated on must not be tuned on, and a second render must not be the first: judged by the files."""
+    tuned = set().union(*(_files(name, frames) for name in noisy)) if validate or second else set()
+    for name in validate:
+        if common := tuned & _files(name, validate_frames):
+            raise SvgfError(
+                f"{min(common)} is both tuned and validated on; the validation would say nothing. Take another sequence, "
+                "or other frames of it: --frames 0-7 --validate-frames 8-15."
+            )
+    for name in second:
+        if common := tuned & _files(name, frames, prefer=SECOND):
+            raise SvgfError(f"{min(common)} is both the noisy frame and its --second; wanted an independent render.")
+
+
+def _files(name: str, frames: str | None, **options: Any) -> set[Path]:
+    from svgf_jax.sequences import find_sequence
+
+    found = find_sequence(name, frames=frames, missing="reset", **options)
+    return {Path(path).resolve() for _, path in found.files if path is not None}
 
 
 def _names(text: str | None) -> tuple[str, ...]:

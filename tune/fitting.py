@@ -48,6 +48,7 @@ class Progress(NamedTuple):
         best_y, best_loss: of all starts so far.
         found: triangle, scatter and number of residuals at `best_y`.
         ended: how this start ended, None while it goes on.
+        endings: how those before it ended.
         pixel_weights: of `Problem`.
     """
 
@@ -60,6 +61,7 @@ class Progress(NamedTuple):
     found: tuple[np.ndarray, np.ndarray, int] | None
     ended: str | None
     pixel_weights: np.ndarray
+    endings: tuple[str, ...] = ()
 
 
 class Fit(NamedTuple):
@@ -143,23 +145,24 @@ def fit(
         problem = problem._replace(pixel_weights=progress.pixel_weights)
     else:
         progress = Progress(0, fresh, (), np.inf, y_start, np.inf, None, None, problem.pixel_weights)
-    endings: dict[int, str] = {}
-    while progress.start < max(starts, 1):
-        if progress.ended is None:
-            try:
+    try:
+        while progress.start < max(starts, 1):
+            if progress.ended is None:
                 progress = _iterate(problem, progress, max_steps=max_steps, least_gain=least_gain)
-            except KeyboardInterrupt:
-                endings = dict.fromkeys(range(progress.start + 1), _INTERRUPTED)
-                break
-            on_iteration(progress.iterations[-1])
-        if progress.ended is not None:
-            endings[progress.start] = progress.ended
-            y_next = _scattered(y_start, seed, progress.start + 1)
-            progress = progress._replace(
-                start=progress.start + 1, descent=solvers.begin(chosen, y_next), loss=np.inf, ended=None
-            )
-        save(progress)
-    return _conclude(problem, progress, endings, shots)
+                on_iteration(progress.iterations[-1])
+            if progress.ended is not None:
+                y_next = _scattered(y_start, seed, progress.start + 1)
+                progress = progress._replace(
+                    start=progress.start + 1,
+                    descent=solvers.begin(chosen, y_next),
+                    loss=np.inf,
+                    ended=None,
+                    endings=(*progress.endings, progress.ended),
+                )
+            save(progress)
+    except KeyboardInterrupt:
+        progress = progress._replace(endings=(_INTERRUPTED,) * (progress.start + 1))
+    return _conclude(problem, progress, shots)
 
 
 def _iterate(problem: Problem, progress: Progress, *, max_steps: int, least_gain: float) -> Progress:
@@ -229,15 +232,15 @@ def _scattered(y_start: np.ndarray, seed: int, start: int) -> np.ndarray:
     return y_start + np.random.default_rng([seed, start]).normal(0, 0.7, y_start.size)
 
 
-def _conclude(problem: Problem, progress: Progress, endings: dict[int, str], shots: Sequence[Shot]) -> Fit:
-    coordinates = problem.coordinates
+def _conclude(problem: Problem, progress: Progress, shots: Sequence[Shot]) -> Fit:
+    coordinates, endings = problem.coordinates, progress.endings
     if progress.found is None:
-        if _INTERRUPTED in endings.values():
+        if _INTERRUPTED in endings:
             raise KeyboardInterrupt
-        raise SvgfError(f"the fit came to nothing: {endings.get(0, 'no trial point could be computed')}")
+        raise SvgfError(f"the fit came to nothing: {endings[0]}")
     accepted = [i for i in progress.iterations if i.accepted and i.loss == progress.best_loss]
     best_start = accepted[0].start if accepted else 0
-    result = endings.get(best_start, "resumed after its end; this is the best so far")
+    result = endings[best_start]
     triangle, scatter, rows = progress.found
     knowledge = learn(triangle, scatter, rows, progress.best_y, coordinates, pull=pull(problem, progress.best_y))
     notes = [*coordinates.notes, *(note for shot in shots for note in shot.notes)]

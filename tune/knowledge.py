@@ -43,7 +43,8 @@ def learn(
 ) -> Knowledge:
     """What the factor `[n + 1, n + 1]` of [J r] and the scatter of its blocks' gradients say at the fitted point.
 
-    `pull` `[n]`: what of the squares of J's columns is from terms that do not look at pixels. A prior is no knowledge.
+    `pull` `[n]`: what of the squares of J's columns is from terms that do not look at pixels, each at one coordinate. A prior is no
+    knowledge: it is taken out again.
     """
     n = y.size
     labels = coordinates.labels
@@ -54,13 +55,15 @@ def learn(
     errors = np.full(n, np.inf)
     correlations = np.eye(n)
     if free.size:
-        size = np.sqrt(np.square(jacobian[:, free]).sum(0))
-        _, values, basis = np.linalg.svd(jacobian[:, free] / size, full_matrices=False)
-        kept = values > 1e-6 * values[0]  # beyond, float32 derivatives say nothing
-        inverse = (basis[kept].T / values[kept] ** 2) @ basis[kept] / np.outer(size, size)
+        normal = jacobian[:, free].T @ jacobian[:, free] - np.diag(np.broadcast_to(pull, n)[free])
+        size = np.sqrt(np.diag(normal))
+        values, basis = np.linalg.eigh(normal / np.outer(size, size))
+        kept = values > 1e-10 * values[-1]  # beyond, float32 derivatives say nothing
+        inverse = (basis[:, kept] / values[kept]) @ basis[:, kept].T / np.outer(size, size)
         variance = loss / max(rows - n, 1) * inverse
         sandwich = inverse @ scatter[np.ix_(free, free)] @ inverse
-        covariance = np.where(np.diag(sandwich).sum() > np.diag(variance).sum(), sandwich, variance)
+        # The larger of the two: over few blocks the sandwich is too small.
+        covariance = max(sandwich, variance, key=lambda matrix: np.diag(matrix).sum())
         deviation = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
         errors[free] = deviation
         correlations[np.ix_(free, free)] = covariance / np.outer(deviation, deviation)

@@ -119,6 +119,7 @@ def conclude(
     save_params(
         out, found.params, found.config, provenance=record
     )  # measuring may be interrupted: this may not be lost
+    terminal.tell(f"parameters -> {out}")
     terminal.warn(found.coordinates.notes)
     terminal.tell(f"{found.result}; loss 1 -> {found.loss:.4f} after {len(found.iterations)} trial points")
     _tell_parameters(found)
@@ -147,7 +148,6 @@ def conclude(
 
         write_report(report, found, start, config, compared, curves, pictures, failures)
         terminal.tell(f"report: {report}")
-    terminal.tell(f"parameters -> {out}")
     if json:
         terminal.print_json(summary(found, compared, curves) | {"out": out, "worse": failures})
     for failure in failures:
@@ -202,7 +202,7 @@ def _tell_parameters(found: Fit) -> None:
     _print(("parameter", "before", "after", "", "leverage"), rows)
     if knowledge.undetermined:
         terminal.tell(
-            f"the data says nothing about {', '.join(knowledge.undetermined)}: take the start's value, or data in which it matters"
+            f"near these values the error hardly depends on {', '.join(knowledge.undetermined)}: the data does not determine it"
         )
     for one, other in knowledge.entangled:
         terminal.tell(f"{one} and {other} make up for each other; only together are they determined")
