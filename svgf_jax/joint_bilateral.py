@@ -9,7 +9,9 @@ Every output pixel i is a mean of the input over a window, sum_j J(i, j) C_j / s
     D_plane = n_i . (x_j - x_i) / |x_j - x_i|, 0 at j = i;
 
 the kernel of GAMES202's homework 5 (2021), with any further guides g. Taps outside the image, and pixels that the mask leaves out,
-count for nothing; a sum of weights below 1e-15 leaves the input pixel. `footprint` says how the window is covered:
+count for nothing; a sum of weights below 1e-15 leaves the input pixel. A pixel whose color is not finite counts for nothing either,
+and becomes the mean of the others by the remaining factors of J, 0 without any; one with a NaN among its guides is as if left out
+by the mask. `footprint` says how the window is covered:
 
 - `full`: all (2 radius + 1)^2 taps at once, the definition.
 - `separable`: a row of 2 radius + 1 taps, then a column of them on its result. The same for a Gaussian, to rounding; otherwise an
@@ -62,14 +64,16 @@ def gaussian_filter(
         image: `[H, W, C]`, any C.
         sigma: in pixels, >= 0; traced.
         radius: of the window, in pixels, >= 0; static.
-        footprint, levels, last_pass: see the module's docstring; `levels` None = log2(radius), rounded.
+        footprint, levels, last_pass: see the module's docstring; the last two are of "atrous", `levels` None = log2(radius),
+            rounded.
         mask: `[H, W]` bool, the pixels that count; the others are neither read nor changed. None = all.
 
     Returns:
         `[H, W, C]`.
 
     Raises:
-        SvgfError: unknown footprint, negative radius or levels, shapes that do not fit together.
+        SvgfError: unknown footprint, radius or levels that are no whole numbers >= 0, levels or last_pass with another
+            footprint than "atrous", shapes that do not fit together.
     """
     return joint_bilateral_filter(
         image,
@@ -152,19 +156,26 @@ def joint_bilateral_filter(
         `[H, W, C]`.
 
     Raises:
-        SvgfError: unknown footprint, negative radius or levels, shapes that do not fit together, a position without normal.
+        SvgfError: as for `gaussian_filter`; a guide that is no pair, a position without normal.
     """
     image = jnp.asarray(image)
-    _check(image, normal, position, guides, mask, radius=radius, footprint=footprint, levels=levels)
+    _check(
+        image, normal, position, guides, mask, radius=radius, footprint=footprint, levels=levels, last_pass=last_pass
+    )
     dtype = image.dtype
-    counts = jnp.ones(image.shape[:2], bool) if mask is None else jnp.asarray(mask, bool)
+    wanted = jnp.ones(image.shape[:2], bool) if mask is None else jnp.asarray(mask, bool)
+    for array in (normal, position, *(g for g, _ in guides)):
+        if array is not None:
+            wanted &= ~jnp.isnan(jnp.asarray(array, dtype).reshape(*image.shape[:2], -1)).any(axis=-1)
+    finite = jnp.isfinite(image).all(axis=-1)
+    counts = wanted & finite
 
     def clean(array) -> tuple[Array, ...]:
         array = jnp.asarray(array, dtype)
-        return tuple(_bounded(jnp.where(counts, g, 0.0)) for g in (planes(array) if array.ndim == 3 else (array,)))
+        return tuple(_bounded(jnp.where(wanted, g, 0.0)) for g in (planes(array) if array.ndim == 3 else (array,)))
 
     if sigma_color is not None:
-        guides = [*guides, (image, sigma_color)]
+        guides = [*guides, (jnp.where(finite[..., None], image, 0.0), sigma_color)]
     guided = bool(guides) or normal is not None
     guide = Guide(
         normal=() if normal is None else clean(normal),
@@ -172,6 +183,7 @@ def joint_bilateral_filter(
         others=tuple(clean(g) for g, _ in guides),
         # Without guides a pixel outside the mask still hands on the sums of its row: a Gaussian stays separable.
         counts=counts.astype(dtype) if guided else jnp.ones_like(counts, dtype),
+        known=() if sigma_color is None else finite.astype(dtype),
     )
     falloff = Falloff(
         normal=_falloff(sigma_normal, dtype),
@@ -192,20 +204,23 @@ def joint_bilateral_filter(
             kernel = jnp.exp(-space * jnp.asarray((offsets**2).sum(axis=1), dtype))
             sums = gather(sums, offsets=offsets, kernel=kernel)
     colors, weight = sums
-    counted = counts & (weight > _LEAST_WEIGHT)
+    counted = wanted & (weight > _LEAST_WEIGHT)
     divisor = jnp.where(counted, weight, 1.0)
-    return jnp.stack(
-        [jnp.where(counted, c / divisor, own) for c, own in zip(colors, planes(image), strict=True)], axis=-1
-    )
+    kept = planes(jnp.where((wanted & ~finite)[..., None], 0.0, image))
+    return jnp.stack([jnp.where(counted, c / divisor, own) for c, own in zip(colors, kept, strict=True)], axis=-1)
 
 
 class Guide(NamedTuple):
-    """What J reads at a pixel, as planes `[H, W]`; () = not given. `counts` is 1 where it may be read, 0 elsewhere and outside."""
+    """What J reads at a pixel, as planes `[H, W]`; () = not given. `counts` is 1 where it may be read, 0 elsewhere and outside.
+
+    `known` is 0 where the pixel has no color to compare others with, the last of `others`.
+    """
 
     normal: tuple[Array, ...]
     position: tuple[Array, ...]
     others: tuple[tuple[Array, ...], ...]
     counts: Array
+    known: Array | tuple[()]
 
 
 class Falloff(NamedTuple):
@@ -249,6 +264,8 @@ def _gather(
 def _likeness(p: Guide, q: Guide, falloff: Falloff) -> Array:
     """J(p, q) without its first factor."""
     terms = [k * _square(a, b) for k, a, b in zip(falloff.others, p.others, q.others, strict=True)]
+    if not isinstance(p.known, tuple):
+        terms[-1] = p.known * terms[-1]
     if p.normal:
         terms.append(falloff.normal * squared_angle(_dot(p.normal, q.normal)))
     if p.position:
@@ -352,17 +369,23 @@ def _square(a: tuple[Array, ...], b: tuple[Array, ...]) -> Array:
     return _dot(difference, difference)
 
 
-def _check(image, normal, position, guides, mask, *, radius: int, footprint: str, levels: int | None) -> None:
+def _check(image, normal, position, guides, mask, *, radius, footprint, levels, last_pass) -> None:
     if footprint not in FOOTPRINTS:
         raise SvgfError(f"no footprint {footprint!r}; there are {', '.join(FOOTPRINTS)}")
-    if radius < 0 or (levels is not None and levels < 0):
-        raise SvgfError(f"radius = {radius}, levels = {levels}; wanted whole numbers >= 0")
+    whole = lambda n: isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 0  # noqa: E731
+    if not (whole(radius) and (levels is None or whole(levels))):
+        raise SvgfError(f"radius = {radius!r}, levels = {levels!r}; wanted whole numbers >= 0")
+    if footprint != "atrous" and (levels is not None or last_pass):
+        raise SvgfError(f"footprint {footprint!r} has no levels and no last_pass; leave them out, or take 'atrous'")
     if image.ndim != 3 or image.shape[-1] == 0 or not jnp.issubdtype(image.dtype, jnp.floating):
         raise SvgfError(f"the image is {image.dtype} of shape {image.shape}; wanted real numbers, [H, W, C]")
     if position is not None and normal is None:
         raise SvgfError(
             "a position guides along its plane only; give the normal too, or give it in guides, with a sigma"
         )
+    for guide in guides:
+        if not (isinstance(guide, tuple | list) and len(guide) == 2):
+            raise SvgfError(f"a guide is a {type(guide).__name__}; wanted pairs: guides=[(depth, 0.1), (albedo, 0.05)]")
     size = image.shape[:2]
     named = [("normal", normal, {(*size, 3)}), ("position", position, {(*size, 3)}), ("mask", mask, {size})]
     named += [("a guide", g, {size, (*size, *jnp.shape(g)[2:3])}) for g, _ in guides]

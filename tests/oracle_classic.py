@@ -13,7 +13,7 @@ import numpy as np
 def likeness(p, q, image, guides, sigmas):
     """J(p, q) without the factor of pixel distance. `guides`: normal, position, and a list `others` of (image, sigma)."""
     exponent = 0.0
-    if sigmas.get("color") is not None:
+    if sigmas.get("color") is not None and np.isfinite(image[p]).all():
         exponent += sum((image[p] - image[q]) ** 2) / (2 * sigmas["color"] ** 2)
     if guides.get("normal") is not None:
         n, m = guides["normal"][p], guides["normal"][q]
@@ -64,7 +64,8 @@ def square(kernel, step):
 def joint_bilateral(image, guides, sigmas, radius, footprint="full", levels=None, last_pass=False, mask=None):
     """The filter; `sigmas`: space, color (None = does not guide), normal, plane. A Gaussian has no guides and no color."""
     height, width, _ = image.shape
-    mask = np.ones((height, width), bool) if mask is None else mask
+    wanted = np.ones((height, width), bool) if mask is None else mask
+    mask = wanted & np.isfinite(image).all(-1)
     guided = sigmas.get("color") is not None or any(g is not None and len(g) for g in guides.values())
     above = np.where(mask[..., None], image, 0.0)
     below = mask.astype(float)
@@ -76,13 +77,14 @@ def joint_bilateral(image, guides, sigmas, radius, footprint="full", levels=None
                     p, q = (y, x), (y + dy, x + dx)
                     if not (0 <= q[0] < height and 0 <= q[1] < width):
                         continue
-                    if guided and not (mask[p] and mask[q]):
+                    if guided and not (wanted[p] and mask[q]):
                         continue
                     w = kernel * (likeness(p, q, image, guides, sigmas) if guided else 1.0)
                     new_above[p] += w * above[q]
                     new_below[p] += w * below[q]
         above, below = new_above, new_below
-    counted = mask & (below > 1e-15)
+    counted = wanted & (below > 1e-15)
+    image = np.where((wanted & ~mask)[..., None], 0.0, image)
     return np.where(counted[..., None], above / np.where(counted, below, 1.0)[..., None], image)
 
 

@@ -80,6 +80,38 @@ def test_images_smaller_than_the_window(size, channels):
     np.testing.assert_allclose(run("joint", s, radius=6), by_loops("joint", s, radius=6), rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.parametrize("footprint", joint_bilateral.FOOTPRINTS)
+@pytest.mark.parametrize("name", ["joint", "gaussian"])
+def test_a_broken_pixel_becomes_the_mean_of_the_others(name, footprint):
+    """Values and both derivatives are finite; a NaN in a guide is as if the mask left the pixel out."""
+    s = scene(8, 9)
+    s["image"][2:4, 3:6, 1] = [[np.nan, np.inf, -np.inf]] * 2
+    options = {"radius": 2, "footprint": footprint}
+    got = run(name, s, mask=s["mask"], **options)
+    np.testing.assert_allclose(got, by_loops(name, s, mask=s["mask"], **options), rtol=1e-10, atol=1e-10)
+    assert np.isfinite(got[s["mask"]]).all()
+    assert (got[2:4, 3:6][s["mask"][2:4, 3:6]] > 0.0).all()
+    if (name, footprint) == ("joint", "separable"):
+        left_out = s["mask"] & (np.arange(9) != 7)
+        holes = dict(s, depth=np.where(np.arange(9) == 7, np.nan, s["depth"]))
+        np.testing.assert_array_equal(
+            run(name, holes, mask=s["mask"], **options), run(name, s, mask=left_out, **options)
+        )
+    if (name, footprint) != ("joint", "full"):
+        return  # derivatives take long to compile
+    function = functools.partial(getattr(joint_bilateral, SETTINGS[name][0]), mask=s["mask"], **options)
+    value = lambda inputs: jnp.where(s["mask"][..., None], function(inputs[0], **inputs[1]), 0.0).sum()  # noqa: E731
+    inputs = (s["image"], arguments(name, s))
+    slopes = lambda x: (jax.grad(value)(x), jax.jvp(value, (x,), (jax.tree.map(jnp.ones_like, x),)))  # noqa: E731
+    found = jax.jit(slopes, compiler_options=dict(QUICK))(inputs)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+
+
+def test_an_image_without_a_finite_pixel_becomes_black():
+    got = joint_bilateral.gaussian_filter(np.full((3, 4, 3), np.nan, np.float32), sigma=1.0, radius=1)
+    np.testing.assert_array_equal(got, np.zeros((3, 4, 3)))
+
+
 def test_a_zero_sum_of_weights_gives_the_input_pixel():
     """Without a normal the clamped dot product is 0, a right angle, even of a pixel with itself: exp(-123) at 0.1 radians."""
     s = scene(6, 7)
@@ -217,6 +249,12 @@ def test_squared_angle(degrees):
     [
         ({"footprint": "ful"}, "no footprint 'ful'; there are full, separable, atrous"),
         ({"radius": -1}, "radius = -1"),
+        ({"radius": 2.5}, "radius = 2.5, levels = None; wanted whole numbers"),
+        ({"levels": True, "footprint": "atrous"}, "levels = True; wanted whole numbers"),
+        ({"last_pass": True}, "footprint 'full' has no levels and no last_pass"),
+        ({"levels": 2, "footprint": "separable"}, "footprint 'separable' has no levels"),
+        ({"guides": [np.zeros((4, 5))]}, "a guide is a ndarray; wanted pairs"),
+        ({"guides": (np.zeros((4, 5)), 0.1)}, "a guide is a ndarray; wanted pairs"),
         ({"position": np.zeros((4, 5, 3))}, "give the normal too"),
         ({"normal": np.zeros((4, 4, 3))}, r"normal has shape \(4, 4, 3\); the image is \(4, 5, 3\)"),
         ({"guides": [(np.zeros((3, 5)), 1.0)]}, r"a guide has shape \(3, 5\)"),
