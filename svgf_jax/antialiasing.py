@@ -4,10 +4,12 @@ After Karis, *High-Quality Temporal Supersampling* (SIGGRAPH 2014 course). Every
 c / (1 + luma), so that one bright sample does not decide a pixel; the way back gives a linear image.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from svgf_jax.check import check_image, check_taa
 from svgf_jax.sampling import STRIP_ROWS, in_strips, planes, read_at, square_offsets, sum_over_taps
 from svgf_jax.tonemapping import compress_luma, expand_luma
 from svgf_jax.types import Params, TaaHistory, at_level
@@ -23,6 +25,7 @@ _FAR = 4.0  # pixels outside the image from where on it makes no difference how 
 
 def taa_init(image: Array) -> TaaHistory:
     """The empty past that a sequence starts with. Only the shape `[H, W, 3]` and the dtype of `image` matter."""
+    check_image(image)
     return TaaHistory(color=jnp.zeros(image.shape, image.dtype), frames=jnp.zeros((), image.dtype))
 
 
@@ -52,7 +55,12 @@ def taa(
     Returns:
         The history, whose color is the display image (on the tone curve), and the linear image `[H, W, 3]`. In float32 the way to
         the curve and back keeps a radiance of 1 to 1e-7 of itself, one of 1000 to 1e-4; the largest is 1e7.
+
+    Raises:
+        SvgfError: shapes or dtypes that do not fit together.
     """
+    history, image, motion, depth = jax.tree.map(jnp.asarray, (history, image, motion, depth))
+    check_taa(history, image, motion, depth)
     height, width, _ = image.shape
     dtype = image.dtype
     alpha = jnp.asarray(at_level(params, 0).taa_alpha, dtype)

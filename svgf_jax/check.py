@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from svgf_jax.types import Config, Frame, History, Params, SvgfError, choices_of, is_choice
+from svgf_jax.types import Config, Frame, History, Params, SvgfError, TaaHistory, choices_of, is_choice
 
 
 def check_frame(frame: Frame) -> None:
@@ -73,6 +73,30 @@ def check_history(history: History, frame: Frame, config: Config) -> None:
             raise SvgfError(
                 f"the history's {name} is {leaf.dtype} {tuple(leaf.shape)}; wanted {jnp.dtype(dtype)} {shapes[name]} for "
                 "this frame. A history belongs to one sequence: start another with init(frame)"
+            )
+
+
+def check_image(image) -> None:
+    """Raise `SvgfError` unless this is one image `[H, W, 3]` of float32 or float64."""
+    if image.ndim != 3 or image.shape[-1] != 3 or image.dtype not in (jnp.float32, jnp.float64):
+        raise SvgfError(f"the image is {image.dtype} {tuple(image.shape)}; wanted float32 or float64 [H, W, 3]")
+
+
+def check_taa(history: TaaHistory, image, motion, depth) -> None:
+    """Raise `SvgfError` unless the arrays of `taa` fit together."""
+    check_image(image)
+    height, width, _ = image.shape
+    named = {
+        "motion": (motion, (height, width, 2)),
+        "depth": (depth, (height, width)),
+        "history's color": (history.color, (height, width, 3)),
+        "history's frames": (history.frames, ()),
+    }
+    for name, (array, wanted) in named.items():
+        if tuple(array.shape) != wanted or array.dtype != image.dtype:
+            raise SvgfError(
+                f"the {name} is {array.dtype} {tuple(array.shape)}; wanted {image.dtype} {wanted}, to go with the image"
+                f"{'. Start another history with taa_init(image)' if name.startswith('history') else ''}"
             )
 
 

@@ -155,3 +155,28 @@ def test_a_history_of_other_choices_is_refused():
         step(init(frame), frame, config=Config(taa=True))
     with pytest.raises(SvgfError, match="has a past"):
         step(init(frame, config=Config(taa=True)), frame)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"image": (10, 24, 3)}, r"the motion is float32 \(20, 24, 2\); wanted float32 \(10, 24, 2\)"),
+        ({"image": (20, 24)}, r"the image is float32 \(20, 24\); wanted float32 or float64 \[H, W, 3\]"),
+        ({"motion": (19, 24, 2)}, r"the motion is float32 \(19, 24, 2\); wanted float32 \(20, 24, 2\)"),
+        ({"depth": (20, 24, 1)}, r"the depth is float32 \(20, 24, 1\); wanted float32 \(20, 24\)"),
+        ({"past": (10, 24, 3)}, r"the history's color is float32 \(10, 24, 3\).* taa_init\(image\)"),
+    ],
+)
+def test_what_does_not_fit_is_told(change, complaint):
+    shapes = {"image": (20, 24, 3), "motion": (20, 24, 2), "depth": (20, 24), "past": (20, 24, 3)} | change
+    arrays = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    with pytest.raises(SvgfError, match=complaint):
+        antialiasing.taa(antialiasing.taa_init(arrays["past"]), arrays["image"], arrays["motion"], arrays["depth"])
+
+
+def test_what_is_no_float_is_told():
+    image, depth = np.zeros((4, 5, 3), np.float32), np.zeros((4, 5), np.int32)
+    with pytest.raises(SvgfError, match="the image is uint8"):
+        antialiasing.taa_init(image.astype(np.uint8))
+    with pytest.raises(SvgfError, match="the depth is int32"):
+        antialiasing.taa(antialiasing.taa_init(image), image, image[..., :2], depth)
