@@ -56,11 +56,17 @@ def tonemap(color: Array, *, curve: str = "reinhard", exposure: float = 1.0) -> 
     """Linear RGB to display-linear RGB in [0, 1]; for a screen, `encode_srgb` comes next.
 
     Args:
-        color: `[..., 3]` scene-linear (any shape for the curves without matrices); negative counts as 0, infinity as very bright.
-        curve: a name of the table at the top of this module. Raises SvgfError for others.
-        exposure: factor on the color, > 0.
+        color: `[..., 3]` scene-linear (any shape for the curves without matrices); negative counts as 0, infinity as very bright,
+            NaN stays NaN. Lists of numbers are taken too.
+        curve: a name of the table at the top of this module.
+        exposure: factor on the color, finite, > 0.
+
+    Raises:
+        SvgfError: another curve or exposure, a color of whole numbers, or not of three channels where the curve has matrices.
     """
-    c, xp = _curve(curve), _module(color)
+    check_exposure(exposure)
+    c, color = _curve(curve), _floats(color)
+    xp = _module(color)
     x = xp.clip(color, 0.0, min(min(c.white, _LARGEST) / exposure, 3e38)) * exposure
     x = x if c.before is None else _transform(x, c.before)
     y = _polynomial(x, c.numerator) / _polynomial(x, c.denominator)
@@ -68,8 +74,10 @@ def tonemap(color: Array, *, curve: str = "reinhard", exposure: float = 1.0) -> 
 
 
 def untonemap(display: Array, *, curve: str = "reinhard", exposure: float = 1.0) -> Array:
-    """The inverse of `tonemap`, as far as that lost nothing (see the table); finite for everything, also for 1."""
-    c, xp = _curve(curve), _module(display)
+    """The inverse of `tonemap`, as far as that lost nothing (see the table); finite for every number, also for 1."""
+    check_exposure(exposure)
+    c, display = _curve(curve), _floats(display)
+    xp = _module(display)
     most = 1.0 - float(np.finfo(display.dtype).eps) / 2  # reinhard reaches 1 at infinity only
     y = xp.clip(display, 0.0, most if curve == "reinhard" else 1.0)
     y = y if c.after is None else xp.clip(_transform(y, _inverse(c.after)), c.numerator[2] / c.denominator[2], 1.0)
@@ -103,6 +111,7 @@ def expand_luma(color: tuple[Array, ...]) -> tuple[Array, ...]:
 
 def encode_srgb(linear: Array) -> Array:
     """Display-linear [0, 1] to the sRGB code value [0, 1] (IEC 61966-2-1)."""
+    linear = _floats(linear)
     xp = _module(linear)
     power = 1.055 * xp.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     return xp.where(linear <= 0.0031308, 12.92 * linear, power)
@@ -110,6 +119,7 @@ def encode_srgb(linear: Array) -> Array:
 
 def decode_srgb(code: Array) -> Array:
     """The inverse of `encode_srgb`."""
+    code = _floats(code)
     xp = _module(code)
     return xp.where(code <= 0.04045, code / 12.92, ((xp.maximum(code, 0.04045) + 0.055) / 1.055) ** 2.4)
 
@@ -131,6 +141,18 @@ def _curve(name: str) -> Curve:
     return CURVES[name]
 
 
+def _floats(array: Any) -> Array:
+    """The array itself, or one of float64 of numbers and lists of them."""
+    if not hasattr(array, "dtype"):
+        try:
+            array = np.asarray(array, np.float64)
+        except (TypeError, ValueError) as error:
+            raise SvgfError(f"Got a {type(array).__name__} as a color ({error}); wanted an array of floats.") from error
+    if array.dtype.kind in "biucOSU":
+        raise SvgfError(f"Got a color of {array.dtype}; wanted floats. Divide 8-bit codes by 255 first.")
+    return array
+
+
 def _module(array: Array) -> Any:
     """NumPy, or whatever module the array says is its own."""
     return np if isinstance(array, np.ndarray | np.generic) else array.__array_namespace__()
@@ -143,6 +165,10 @@ def _polynomial(x: Array, coefficients: tuple[float, float, float]) -> Array:
 
 
 def _transform(color: Array, matrix: Matrix) -> Array:
+    if color.shape[-1:] != (3,):
+        raise SvgfError(
+            f"Got a color of shape {tuple(color.shape)}; this curve mixes red, green and blue, and wants [..., 3]."
+        )
     red, green, blue = color[..., 0], color[..., 1], color[..., 2]
     return _module(color).stack([r * red + g * green + b * blue for r, g, b in matrix], axis=-1)
 

@@ -91,3 +91,30 @@ def test_an_unknown_curve_is_named_and_the_command_line_knows_all():
     with pytest.raises(SvgfError, match="no tone curve 'filmic'; there are reinhard-extended, reinhard, aces"):
         tonemap(COLORS, curve="filmic")
     assert get_args(Tonemap) == tuple(CURVES)
+
+
+@pytest.mark.parametrize("exposure", [0, -1, np.inf, np.nan])
+def test_an_exposure_that_means_nothing_is_refused(exposure):
+    for function in (tonemap, untonemap):
+        with pytest.raises(SvgfError, match="wanted a finite number above 0"):
+            function(COLORS, exposure=exposure)
+
+
+@pytest.mark.parametrize("function", [tonemap, untonemap, encode_srgb, decode_srgb])
+def test_lists_are_taken_and_whole_numbers_refused(function):
+    np.testing.assert_array_equal(function([[0, 0.25, 1]]), function(np.array([[0, 0.25, 1]])))
+    for whole in (np.zeros((2, 3), np.uint8), jnp.zeros((2, 3), jnp.int32)):
+        with pytest.raises(SvgfError, match=f"Got a color of {whole.dtype}; wanted floats"):
+            function(whole)
+    with pytest.raises(SvgfError, match="Got a list as a color"):
+        function([[0.0], [1.0, 2.0]])
+    assert np.isnan(function(np.array([[0.5, 0.5, np.nan]]))).tolist() == [[False, False, True]]
+
+
+def test_hills_curve_wants_three_channels_and_is_darker_than_narkowiczs():
+    with pytest.raises(SvgfError, match=r"Got a color of shape \(200, 2\)"):
+        tonemap(COLORS[:, :2], curve="aces-hill")
+    grey = [[0.18] * 3, [1.0] * 3]
+    np.testing.assert_allclose(tonemap(grey, curve="aces-hill")[0], 0.106, atol=5e-4)
+    there, here = tonemap(grey, curve="aces-hill", exposure=2.0), tonemap(grey, curve="aces-narkowicz")
+    np.testing.assert_allclose(there, here, atol=0.005)
