@@ -17,6 +17,22 @@ os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
+# What takes longest begins first, so that two workers end together (with --no-loadscope-reorder).
+LONGEST = (
+    "test_gradients",
+    "test_tune_fit",
+    "test_cli",
+    "test_claims",
+    "test_adaptation",
+    "test_pipeline_oracle",
+    "test_mutants",
+)
+
+
+def pytest_collection_modifyitems(items):
+    rank = {name: i for i, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
 
 @pytest.fixture(scope="session")
 def data() -> Path:
