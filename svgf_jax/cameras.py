@@ -191,24 +191,28 @@ def mismatch(
     where: np.ndarray,
     *,
     origin: tuple[int, int] = (0, 0),
-) -> str | None:
-    """What is wrong if positions `[H, W, 3]`, depths `[H, W]` and camera are not of one scene, in words; None if they are.
+) -> tuple[str, str] | None:
+    """What is wrong if positions `[H, W, 3]`, depths `[H, W]` and camera are not of one scene, and how much; None if they are.
 
     Judged by the pixels `where` `[H, W]`, of which 1 % may be odd.
     """
     if not where.any():
         return None
-    if (position_residual(camera, position, origin=origin)[where] > APART).mean() > 0.01:
+    beside = position_residual(camera, position, origin=origin)[where]
+    if (share := (beside > APART).mean()) > 0.01:
+        most = beside[np.isfinite(beside)].max(initial=0.0)
         return (
             f"positions are shown more than {APART} pixels beside the centres of their pixels: motion and previous depths will be "
-            "wrong. Wanted cameras of the same frames, pixels counted from the top left, and no jitter but that of the positions."
+            "wrong. Wanted cameras of the same frames, pixels counted from the top left, and no jitter but that of the positions.",
+            f"{100 * share:.3g} % of the pixels with a surface, at most {most:.3g} pixels beside.",
         )
     forward = camera.world_to_camera[2]
     z = position[where].astype(np.float64) @ forward[:3] + forward[3]
-    if depth is not None and (np.abs(z - depth[where]) > 0.01 * np.abs(z)).mean() > 0.01:
+    if depth is not None and (share := (np.abs(z - depth[where]) > 0.01 * np.abs(z)).mean()) > 0.01:
         return (
             "depth is not the camera's z of the positions: history will be rejected. Wanted the distance along the viewing axis, "
-            "positive in front of the camera."
+            "positive in front of the camera.",
+            f"{100 * share:.3g} % of the pixels with a surface are more than 1 % off.",
         )
     return None
 

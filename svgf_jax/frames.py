@@ -30,6 +30,7 @@ from svgf_jax.sequences import Missing, Sequence, beside, companion, find_sequen
 from svgf_jax.types import Frame, SvgfError
 
 _BESIDE = ("emission", "albedo", "normal", "depth", "motion", "id", "position")
+_IN_FRAME = " In frame "  # what follows it in a note are that frame's numbers
 FAR = 1e8
 """Depths from here on are the renderers' way of saying that nothing was hit."""
 
@@ -197,7 +198,7 @@ def load_sequence(pattern: PathName, **options: Any) -> Frame:
     source = open_source(pattern, **options)
     with ThreadPoolExecutor(4) as pool:
         items = list(pool.map(lambda index: read_frame(source, index), range(len(source.sequence.files))))
-    for note in dict.fromkeys(note for item in items for note in item.notes):
+    for note in told_once(note for item in items for note in item.notes):
         warnings.warn(note, stacklevel=2)
     frames = [item.frame for item in items]
     stacked: list[Any] = [None if planes[0] is None else np.stack(planes) for planes in zip(*frames, strict=True)]
@@ -301,11 +302,19 @@ def _position(
     if position is not None:
         known = depth if "depth" in planes else None
         seen = surface & np.isfinite(position).all(-1)
-        if text := mismatch(camera, position, known, seen, origin=_origin(source)):
-            notes.append(f"{source.cameras.path}: {text}")
+        if found := mismatch(camera, position, known, seen, origin=_origin(source)):
+            notes.append(f"{source.cameras.path}: {found[0]}{_IN_FRAME}{number}: {found[1]}")
     elif source.position:
         position = position_from_depth(camera, np.where(surface, depth, 1.0), origin=_origin(source)).astype(np.float32)
     return position
+
+
+def told_once(notes: Iterable[str]) -> tuple[str, ...]:
+    """Each note once; of those that only tell another frame's numbers, the first."""
+    first: dict[str, str] = {}
+    for note in notes:
+        first.setdefault(note.partition(_IN_FRAME)[0], note)
+    return tuple(first.values())
 
 
 def _origin(source: Source) -> tuple[int, int]:

@@ -137,14 +137,14 @@ def run(
     )
     statuses: Counter[str] = Counter()
     counts: Counter[str] = Counter()
-    notes: dict[str, None] = {}
+    notes: list[str] = []
     device_name: list[str] = []
 
     def done(report: FrameReport | None) -> None:
         if report is not None:
             statuses[report.status] += 1
             counts.update(report.counts)
-            notes.update(dict.fromkeys(report.notes))
+            notes[:] = frames.told_once([*notes, *report.notes])
             on_frame(report)
 
     def filters() -> Filters:

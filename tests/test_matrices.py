@@ -1,5 +1,6 @@
 """GAMES202's files as they are: found without being named, matrices read and checked, motion and previous depth exact."""
 
+import re
 import shutil
 
 import games202
@@ -112,6 +113,11 @@ def test_cameras_of_another_picture_are_told_once(shot, tmp_path):
     with pytest.warns(UserWarning, match=r"matrix_#\.mat: positions are shown more than 0\.1 pixels beside") as told:
         load_sequence(upside_down)
     assert len(told) == 1
+    share, most = re.search(
+        r" In frame 0: ([\d.]+) % of .* at most ([\d.]+) pixels beside\.$", str(told[0].message)
+    ).groups()
+    assert 90 < float(share) <= 100
+    assert games202.SIZE[0] / 2 < float(most) < 2 * games202.SIZE[0]
 
 
 def test_a_depth_that_is_no_z_is_told(shot, tmp_path):
@@ -119,6 +125,7 @@ def test_a_depth_that_is_no_z_is_told(shot, tmp_path):
     notes = read_frame(open_source(distance), 1).notes
     assert len(notes) == 1
     assert "depth is not the camera's z" in notes[0]
+    assert notes[0].endswith("In frame 1: 100 % of the pixels with a surface are more than 1 % off.")
 
 
 def test_what_is_in_the_file_or_given_by_hand_comes_first(shot, tmp_path):
