@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from svgf_jax.moments import start_welford as start_welford
     from svgf_jax.moments import variance_of as variance_of
     from svgf_jax.moments import variance_of_mean as variance_of_mean
+    from svgf_jax.outliers import clamp_outliers as clamp_outliers
     from svgf_jax.outliers import remove_outliers as remove_outliers
     from svgf_jax.parameters import load_params as load_params
     from svgf_jax.parameters import preset as preset
@@ -87,7 +88,7 @@ _HOME = {
         *("Sums", "Welford", "add_sample", "mean_of", "merge_samples"),
         *("start_sums", "start_welford", "variance_of", "variance_of_mean"),
     ],
-    "outliers": ["remove_outliers"],
+    "outliers": ["clamp_outliers", "remove_outliers"],
     "parameters": ["load_params", "preset", "save_params"],
     "pipeline": ["denoise", "init", "step"],
     "references": ["load_reference", "read_radiance"],

@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from svgf_jax.color import largest_luminance
 from svgf_jax.sampling import STRIP_ROWS, planes, stack_planes
-from svgf_jax.types import Config, Frame, Params, at_level
+from svgf_jax.types import Config, Frame, Params, SvgfError, at_level
 from svgf_jax.windows import window_range
 
 
@@ -34,15 +35,44 @@ def remove_outliers(
     """
     if not config.outlier_radius:
         return illumination
-    surface = frame.object_id != -1
     colors = tuple(map(planes, illumination))
-    least, most = window_range(
-        colors,
-        surface,
-        radius=config.outlier_radius,
-        sigma=at_level(params, 0).outlier_sigma,
-        centre=False,
-        strip_rows=strip_rows,
-    )
-    clamp = lambda own, low, high: jnp.where(surface, jnp.minimum(jnp.maximum(own, low), high), own)  # noqa: E731
-    return stack_planes(jax.tree.map(clamp, colors, least, most))
+    options = {"radius": config.outlier_radius, "sigma": at_level(params, 0).outlier_sigma, "strip_rows": strip_rows}
+    return stack_planes(_clamp(colors, frame.object_id != -1, **options))
+
+
+def clamp_outliers(image: Array, *, radius: int = 3, sigma: Array | float = 10.0, mask: Array | None = None) -> Array:
+    """The same for any image, without a frame.
+
+    Args:
+        image: `[H, W, C]`, any C; NaN counts as 0, infinity as the largest color.
+        radius: of the window, in pixels, >= 0; static. 0 = the image as it is.
+        sigma: in standard deviations, >= 0; traced.
+        mask: `[H, W]` bool, the pixels that count; the others are neither read nor changed. None = all.
+
+    Returns:
+        `[H, W, C]`.
+
+    Raises:
+        SvgfError: an image or a mask of another shape, a radius that is no whole number >= 0.
+    """
+    image = jnp.asarray(image)
+    if image.ndim != 3 or image.shape[-1] == 0 or not jnp.issubdtype(image.dtype, jnp.floating):
+        raise SvgfError(f"the image is {image.dtype} of shape {image.shape}; wanted real numbers, [H, W, C]")
+    if mask is not None and jnp.shape(mask) != image.shape[:2]:
+        raise SvgfError(f"mask has shape {jnp.shape(mask)}; the image is {image.shape}")
+    if type(radius) is not int or radius < 0:
+        raise SvgfError(f"radius = {radius!r}; wanted a whole number >= 0")
+    if not radius:
+        return image
+    counts = jnp.ones(image.shape[:2], bool) if mask is None else jnp.asarray(mask, bool)
+    limit = largest_luminance(image.dtype)
+    known = jnp.where(counts[..., None], jnp.nan_to_num(image, posinf=limit, neginf=-limit), 0.0)
+    clamped = jnp.stack(_clamp(planes(known), counts, radius=radius, sigma=sigma, strip_rows=STRIP_ROWS), axis=-1)
+    return jnp.where(counts[..., None], clamped, image)
+
+
+def _clamp(colors, counts: Array, *, radius: int, sigma: Array | float, strip_rows: int | None):
+    """A tree of planes `[H, W]`, each within its range where `counts`."""
+    least, most = window_range(colors, counts, radius=radius, sigma=sigma, centre=False, strip_rows=strip_rows)
+    clamp = lambda own, low, high: jnp.where(counts, jnp.minimum(jnp.maximum(own, low), high), own)  # noqa: E731
+    return jax.tree.map(clamp, colors, least, most)

@@ -32,7 +32,7 @@ def test_the_public_names_are_these():
             "estimate_variance",
             "edge_weight",
         ),
-        *("gaussian_filter", "bilateral_filter", "joint_bilateral_filter", "remove_outliers"),
+        *("gaussian_filter", "bilateral_filter", "joint_bilateral_filter", "clamp_outliers", "remove_outliers"),
         *("atrous_level", "atrous_filter", "luminance", "tonemap", "untonemap", "encode_srgb", "decode_srgb"),
         *("preset", "load_params", "save_params"),
         *("Sums", "Welford", "start_sums", "start_welford", "add_sample", "merge_samples"),

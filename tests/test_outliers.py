@@ -9,7 +9,7 @@ import scenes
 from bridge import QUICK, to_config, to_frame, to_params
 
 from svgf_jax import outliers, pipeline
-from svgf_jax.types import Config
+from svgf_jax.types import Config, SvgfError
 
 CONFIG = {"levels": 0, "feedback_level": 0}
 
@@ -43,6 +43,30 @@ def test_remove_outliers(radius, sigma):
     np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-9)
     assert (np.abs(got - light).max((1, 2, 3)) > 10).all()
     np.testing.assert_array_equal(got[:, frame["object_id"] == -1], light[:, frame["object_id"] == -1])
+
+
+def test_an_image_alone():
+    """As the stage does it; what is not finite outside the mask stays, inside nothing but numbers comes out."""
+    frame, light = scene()
+    mask, image = frame["object_id"] != -1, np.where((frame["object_id"] == -1)[..., None], np.nan, light[0])
+    function = lambda i: outliers.clamp_outliers(i, radius=1, sigma=0.5, mask=mask)  # noqa: E731
+    clamped = jax.jit(function, compiler_options=dict(QUICK))
+    wanted = oracle.remove_outliers(light[0], mask, 1, 0.5)
+    np.testing.assert_allclose(clamped(image)[mask], wanted[mask], rtol=1e-9, atol=1e-9)
+    assert np.isnan(clamped(image)[~mask]).all()
+    image[mask] = np.where(np.arange(3) == 0, np.nan, np.where(np.arange(3) == 1, np.inf, image[mask]))
+    assert np.isfinite(clamped(image)[mask]).all()
+    total = lambda i: jnp.where(mask[..., None], function(i), 0.0).sum()  # noqa: E731
+    assert np.isfinite(jax.jit(jax.grad(total), compiler_options=dict(QUICK))(image)).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [({"radius": 2.5}, "radius = 2.5; wanted a whole"), ({"mask": np.ones((3, 5), bool)}, r"mask has shape \(3, 5\)")],
+)
+def test_misuse_of_an_image_alone_is_told(options, complaint):
+    with pytest.raises(SvgfError, match=complaint):
+        outliers.clamp_outliers(np.zeros((4, 5, 3), np.float32), **options)
 
 
 def test_fireflies_far_brighter_than_float32_can_average():
