@@ -1,6 +1,6 @@
 """The table of docs/games202.md: flicker, grain and ghost of each method on the homework's box scene.
 
-python tests/bench/games202_box.py ../shared/data/games202-box
+python tests/bench/games202_box.py FOLDER       (the homework's scene `box`, as handed out)
 """
 
 import sys

@@ -29,13 +29,15 @@ DATA = Path(__file__).parents[3] / "shared" / "data" / "cornell-dolly"
 RESULTS = Path(__file__).with_suffix(".json")
 
 
-def timed(run, repeats: int = 2) -> float:
-    best = float("inf")
-    for _ in range(repeats):
-        began = time.monotonic()
-        run()
-        best = min(best, time.monotonic() - began)
-    return best
+def timed(*runs, rounds: int = 3) -> list[float]:
+    """Median seconds of each of `runs`, taken in turns."""
+    seconds = [[] for _ in runs]
+    for _ in range(rounds):
+        for run, spent in zip(runs, seconds, strict=True):
+            began = time.monotonic()
+            run()
+            spent.append(time.monotonic() - began)
+    return [float(np.median(spent)) for spent in seconds]
 
 
 def looped(shot: tune.Shot, length: int) -> tune.Shot:
@@ -66,8 +68,8 @@ def trial_point(frames: int) -> dict:
         y = to_free(coordinates.start, coordinates)
         posed = pose(coordinates, y, REFERENCE, [shot])
         sweep(posed, y, linear=True)
-        plain, linear = (timed(lambda d=d, p=posed, y=y: sweep(p, y, linear=d)) for d in (False, True))
-        bare = timed(filter_only)
+        passes = (lambda d=d, p=posed, y=y: sweep(p, y, linear=d) for d in (False, True))
+        bare, plain, linear = timed(filter_only, *passes)
         results[n] = {
             "filter_s": bare,
             "loss_only_s": plain,
