@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from svgf_jax.parameters import suggest
 from svgf_jax.types import CHOICES, Config, Params, SvgfError, bounds_of, choices_of, is_choice
 
 
@@ -144,8 +145,7 @@ def method(name: str) -> tuple[Any, MethodConfig]:
     Raises SvgfError: no such method.
     """
     if name not in METHODS:
-        near = difflib.get_close_matches(name, METHODS, n=1)
-        hint = f". Did you mean {near[0]}?" if near else "; SVGF itself has presets"
+        hint = suggest(name, METHODS) or "; SVGF itself has presets"
         raise SvgfError(f"no method {name!r}; there are {', '.join(METHODS)}{hint}")
     return METHODS[name].params, METHODS[name].config
 

@@ -10,9 +10,10 @@ FLOORS = [
     {"atomic"},
     {"types"},
     {"tonemapping"},
-    {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments", "methods"},
+    {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments"},
     {"windows"},
     {
+        "methods",
         "edges",
         "exr",
         "sanitation",

@@ -4,7 +4,6 @@ Scales (0, inf) are free in their logarithm, blends and cosines (least, most) in
 of what they exceed 1 by. One free number moves one scalar parameter, or one level of a per-level one.
 """
 
-import difflib
 import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from svgf_jax import Config, Params, SvgfError
-from svgf_jax.parameters import BOUNDS
+from svgf_jax.parameters import BOUNDS, suggest
 from svgf_jax.types import unread
 
 TUNED_BY_DEFAULT = (
@@ -212,11 +211,7 @@ def _entry(value: Any, level: int | None) -> Any:
 def _parse(label: str) -> tuple[str, int | None]:
     name, bracket, rest = label.strip().partition("[")
     if name not in BOUNDS:
-        close = difflib.get_close_matches(name, BOUNDS, n=1)
-        raise SvgfError(
-            f"no parameter {name!r} to tune; there are {', '.join(BOUNDS)}"
-            + (f". Did you mean {close[0]}?" if close else "")
-        )
+        raise SvgfError(f"no parameter {name!r} to tune; there are {', '.join(BOUNDS)}{suggest(name, BOUNDS)}")
     if not bracket:
         return name, None
     if not rest.endswith("]") or not rest[:-1].isdigit():

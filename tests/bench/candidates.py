@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 import svgf_jax as sj
-from svgf_jax.metrics import mean_scores, score
+from svgf_jax.metrics import mean_scores, score_frames
 from svgf_jax.types import Config, History, Params
 
 RESULTS = Path(__file__).with_suffix(".json")
@@ -66,11 +66,8 @@ def main() -> None:
     for folder in sys.argv[1:]:
         references = sj.load_reference(folder)
         for kind, alpha, k in choices:
-            scores, previous = [], None
-            for image, reference in zip(images(folder, kind, alpha, k), references, strict=True):
-                scores.append(score(image, reference, previous=previous))
-                previous = (image, reference)
-            mean = mean_scores(scores)
+            pairs = zip(images(folder, kind, alpha, k), references, strict=True)
+            mean = mean_scores(s for s in score_frames(pairs) if s is not None)
             name = f"clamp {k:g}" if kind == "clamp" else f"fast {alpha:g}, {k:g}"
             stored = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
             stored.setdefault(Path(folder).name, {})[name] = {"psnr": mean.psnr, "temporal": mean.temporal}

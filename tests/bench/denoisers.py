@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from svgf_jax import Config, Frame, Params, init, load_reference, open_source, preset, read_frame, step
-from svgf_jax.metrics import mean_scores, score
+from svgf_jax.metrics import mean_scores, score_frames
 
 RESULTS = Path(__file__).with_suffix(".json")
 Denoiser = Callable[[Iterator[Frame]], Iterator[tuple[np.ndarray, float]]]  # (image, seconds) of each frame
@@ -85,12 +85,15 @@ def measure(folder: Path, denoiser: Denoiser, frames: str | None, flip: bool) ->
     source = open_source(str(folder), frames=frames)
     count = len(source.sequence.files)
     references = load_reference(str(folder), frames=frames)
-    scores, seconds, previous = [], [], None
     read = (read_frame(source, i).frame for i in range(count))
-    for (image, spent), reference in zip(denoiser(read), references, strict=True):
-        scores.append(score(image, reference, previous=previous, with_flip=flip))
-        previous = (image, reference)
-        seconds.append(spent)
+    seconds = []
+
+    def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for (image, spent), reference in zip(denoiser(read), references, strict=True):
+            seconds.append(spent)
+            yield image, reference
+
+    scores = [s for s in score_frames(pairs(), with_flip=flip) if s is not None]
     return mean_scores(scores)._asdict() | {"seconds": float(np.median(seconds)), "frames": count}
 
 
