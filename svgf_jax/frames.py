@@ -159,16 +159,7 @@ def read_frame(source: Source, index: int) -> LoadedFrame:
     Raises SvgfError that names the file: missing, unreadable, of another size than the first frame, without a channel.
     """
     number, path = source.sequence.files[index]
-    if path is None:
-        raise SvgfError(f"{source.sequence.name}: frame {number} is missing; render it, or go on without (--missing).")
-    images = {path: _read(path, source)}
-    planes: dict[str, np.ndarray] = {}
-    for role, layer in source.roles.layers.items():
-        where = str(source.files[role].files[index][1]) if layer.own_file else path
-        if where not in images:
-            images[where] = _read(where, source)
-        check_channels(layer, images[where].channels, where=where, role=role)
-        planes[role] = _stack(images[where], layer.channels)
+    planes, image = read_planes(source, index)
     counts: dict[str, int] = {}
     notes: list[str] = []
     with np.errstate(all="ignore"):  # whatever is not finite is dealt with by name below, or by the filter
@@ -187,7 +178,23 @@ def read_frame(source: Source, index: int) -> LoadedFrame:
     arrays: list[Any] = [radiance, albedo[None], emission, normal, depth, prev_depth, motion, object_id, variance]
     arrays.append(position if source.position else None)
     counts = {reason: count for reason, count in counts.items() if count}
-    return LoadedFrame(Frame(*arrays), number, path, images[path], counts, tuple(notes))
+    return LoadedFrame(Frame(*arrays), number, str(path), image, counts, tuple(notes))
+
+
+def read_planes(source: Source, index: int) -> tuple[dict[str, np.ndarray], exr.Image]:
+    """The channels of each role of a frame as its files have them, `[H, W, C]`, and its main file. Raises as `read_frame`."""
+    number, path = source.sequence.files[index]
+    if path is None:
+        raise SvgfError(f"{source.sequence.name}: frame {number} is missing; render it, or go on without (--missing).")
+    images = {path: _read(path, source)}
+    planes: dict[str, np.ndarray] = {}
+    for role, layer in source.roles.layers.items():
+        where = str(source.files[role].files[index][1]) if layer.own_file else path
+        if where not in images:
+            images[where] = _read(where, source)
+        check_channels(layer, images[where].channels, where=where, role=role)
+        planes[role] = _stack(images[where], layer.channels)
+    return planes, images[path]
 
 
 def load_sequence(pattern: PathName, **options: Any) -> Frame:
