@@ -2,6 +2,7 @@
 
 A parameter file is TOML:
 
+    schema = 1                  # of this file; optional
     preset = "paper"            # where values come from that are not given below; optional
 
     [params]                    # numbers of `Params`: one value, or one per a-trous level
@@ -17,7 +18,6 @@ A parameter file is TOML:
 import difflib
 import math
 import os
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,11 @@ from typing import Any
 import tomli_w
 
 from svgf_jax import atomic
+from svgf_jax.toml import TomlFile, place, read_toml
 from svgf_jax.types import Config, Params, SvgfError, bounds_of, choices_of, is_choice
+
+SCHEMA = 1
+"""The kind of parameter file that is written here, and the only one that is read."""
 
 PRESETS: dict[str, tuple[Params, Config]] = {
     "paper": (Params(), Config()),
@@ -93,28 +97,49 @@ def preset(name: str) -> tuple[Params, Config]:
 
 
 def load_params(path: str | os.PathLike[str]) -> tuple[Params, Config]:
-    """Read a parameter file. Raises `SvgfError` that names the file, the key, what was got and what was wanted."""
-    file = Path(path)
-    try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise SvgfError(f"{file}: no such parameter file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise SvgfError(f"{file}: can't be read as text: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise SvgfError(f"{file}: not TOML: {error}") from None
-
-    known = {"preset", "params", "config", "provenance"}
-    for key in content.keys() - known:
-        raise SvgfError(f"{file}: unknown key {key!r}; wanted {', '.join(sorted(known))}{suggest(key, known)}")
-    for table in known - {"preset"}:
-        if not isinstance(content.get(table, {}), dict):
-            raise SvgfError(f"{file}: {table} is {content[table]!r}; wanted a table, [{table}]")
+    """Read a parameter file. Raises `SvgfError` that names the file, the line, what was got and what was wanted."""
+    file = read_toml(Path(path), "parameter file")
+    _check_keys(file)
+    content = file.content
     try:
         params, config = preset(content.get("preset", "paper"))
-        return override(params, config, {**content.get("config", {}), **content.get("params", {})})
     except (SvgfError, TypeError) as error:
-        raise SvgfError(f"{file}: {error}") from None
+        raise SvgfError(f"{place(file, 'preset')}: {error}") from None
+    levels = config.levels
+    for table, names, other in (("config", Config._fields, "params"), ("params", Params._fields, "config")):
+        for key, value in content.get(table, {}).items():
+            try:
+                if key not in names:
+                    hint = f"; it belongs into [{other}]" if key in (*Params._fields, *Config._fields) else ""
+                    raise SvgfError(
+                        f"no {key!r} in [{table}]{hint or suggest(key, names)}. There are {', '.join(names)}"
+                    )
+                levels = _choice(key, value) if key == "levels" else levels
+                _choice(key, value) if table == "config" else _number(key, value, levels)
+            except SvgfError as error:
+                raise SvgfError(f"{place(file, table, key)}: {error}") from None
+    try:
+        return override(params, config, {**content.get("config", {}), **content.get("params", {})})
+    except SvgfError as error:  # what the preset gives per level does not fit
+        raise SvgfError(f"{place(file, 'config', 'levels')}: {error}") from None
+
+
+def _check_keys(file: TomlFile) -> None:
+    known = ("schema", "preset", "params", "config", "provenance")
+    for key, value in file.content.items():
+        if key not in known:
+            raise SvgfError(f"{place(file, key)}: unknown key {key!r}{suggest(key, known)}; wanted {', '.join(known)}")
+        if key in known[2:] and not isinstance(value, dict):
+            raise SvgfError(f"{place(file, key)}: {key} is {value!r}; wanted a table, [{key}]")
+    if type(schema := file.content.get("schema", SCHEMA)) is not int or schema != SCHEMA:
+        raise SvgfError(f"{place(file, 'schema')}: schema = {schema!r}; wanted {SCHEMA}. Is it of another version?")
+
+
+def load_provenance(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What a parameter file says of its origin; {} if nothing. Raises `SvgfError` as `load_params` does."""
+    file = read_toml(Path(path), "parameter file")
+    _check_keys(file)
+    return file.content.get("provenance", {})
 
 
 def save_params(
@@ -136,6 +161,7 @@ def save_params(
 def to_toml(params: Params, config: Config = Config(), *, provenance: Mapping[str, Any] | None = None) -> str:
     """The text of a parameter file."""
     content: dict[str, Any] = {
+        "schema": SCHEMA,
         "params": {name: _plain(value) for name, value in params._asdict().items()},
         "config": config._asdict(),
     }

@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"atomic"},
     {"types"},
-    {"tonemapping"},
+    {"tonemapping", "toml"},
     {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments"},
     {"windows"},
     {
@@ -48,6 +48,7 @@ STAGES = {
 NUMPY_ONLY = {
     "atomic",
     "types",
+    "toml",
     "parameters",
     "metrics",
     "exr_layout",
