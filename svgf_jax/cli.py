@@ -15,7 +15,7 @@ from svgf_jax.commands.ablate import ablate
 from svgf_jax.commands.compare import compare
 from svgf_jax.commands.demo import demo
 from svgf_jax.commands.denoise import denoise
-from svgf_jax.commands.params import list_, show
+from svgf_jax.commands.params import diff, list_, show
 from svgf_jax.commands.video import video
 from svgf_jax.types import SvgfError
 
@@ -31,9 +31,10 @@ app.command(compare)
 app.command(ablate)
 app.command(demo)
 app.command(video)
-params = App(name="params", help="Show presets and parameters.", help_format="plaintext")
+params = App(name="params", help="Show and compare presets, methods and parameter files.", help_format="plaintext")
 params.command(list_, name="list")
 params.command(show)
+params.command(diff)
 app.command(params)
 
 

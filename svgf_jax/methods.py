@@ -42,7 +42,16 @@ class AccumulateParams(NamedTuple):
 
 
 class Games202Params(NamedTuple):
-    """The numbers of GAMES202's homework 5: those of `JointBilateralParams` and of `AccumulateParams`."""
+    """The numbers of GAMES202's homework 5: those of `JointBilateralParams` and of `AccumulateParams`.
+
+    Attributes:
+        sigma_space: standard deviation of the window, in pixels, >= 0.
+        sigma_color: how far colours may differ, in units of the radiance, >= 0.
+        sigma_normal: how far normals may turn, in radians, >= 0.
+        sigma_plane: how far a pixel may rise from the other's plane, the sine of an angle, >= 0.
+        alpha: weight of the new frame, in [0, 1].
+        clamp_sigma: standard deviations that the history may lie off this frame's mean, >= 0.
+    """
 
     sigma_space: Any = 32.0
     sigma_color: Any = 0.6
