@@ -6,9 +6,9 @@ declared twice. Nothing here or in `commands` imports JAX, NumPy or rich at the 
 
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, Group, Parameter
 
 from svgf_jax import __version__
 from svgf_jax.commands.ablate import ablate
@@ -16,6 +16,7 @@ from svgf_jax.commands.compare import compare
 from svgf_jax.commands.demo import demo
 from svgf_jax.commands.denoise import denoise
 from svgf_jax.commands.params import diff, list_, show
+from svgf_jax.commands.project import OTHERS, use_project
 from svgf_jax.commands.video import video
 from svgf_jax.types import SvgfError
 
@@ -38,10 +39,41 @@ params.command(diff)
 app.command(params)
 
 
+@app.command
+def completion(shell: Literal["bash", "zsh", "fish", "powershell"], /, *, install: bool = False) -> None:
+    """Print a script that completes commands and flags in a shell, for example: eval "$(svgf-jax completion bash)".
+
+    Args:
+        shell: Whose completion.
+        install: Write it where the shell looks for it instead, and into the shell's start file where that is needed.
+    """
+    if install:
+        print(app.install_completion(shell=shell))
+    else:
+        print(app.generate_completion(shell=shell), end="")
+
+
+@app.meta.default
+def launch(
+    *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
+    config: Annotated[str, Parameter(metavar="FILE", group=Group("Project", sort_key=9))] = "auto",
+) -> Any:
+    """Run a command with the project's file behind it.
+
+    Args:
+        config: Flags of this project, a table for each command; auto takes the nearest svgf-jax.toml, none ignores it.
+    """
+    use_project(app, config, tables=(*(name for name in app if not name.startswith("-")), *OTHERS))
+    try:
+        return app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+    finally:
+        app.config = ()
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit: 0, 2 for an error that its message explains, 130 or 143 when interrupted."""
     try:
-        code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+        code = app.meta(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
         called = [name for name in (sys.argv[1:] if arguments is None else arguments)[:1] if name in app]
         fail(f"{str(error).strip()} See `{' '.join(['svgf-jax', *called, '--help'])}`.")

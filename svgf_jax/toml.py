@@ -18,6 +18,7 @@ class TomlFile(NamedTuple):
 
 def read_toml(path: Path, what: str) -> TomlFile:
     """Read a TOML file; `what` it is, for the errors. Raises SvgfError: not there, not text, not TOML (with the line)."""
+    text = ""
     try:
         text = path.read_text(encoding="utf-8")
         return TomlFile(path, text, tomllib.loads(text))

@@ -1,0 +1,108 @@
+"""`svgf-jax.toml`, the project's own flags, and shell completion."""
+
+from pathlib import Path
+
+import pytest
+
+from svgf_jax import cli
+from svgf_jax.commands import denoise, project
+from svgf_jax.commands.project import nearest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def chosen(tmp_path, monkeypatch):
+    """A function: (project file, arguments of denoise) -> what the command would have done them with."""
+    monkeypatch.chdir(tmp_path)
+    told = {}
+
+    def choose_method(method, preset, params, changes):
+        told.update(method=method, preset=preset, params=params, set=changes)
+        return "", None, None
+
+    def assignments(texts, *, option, example):
+        told[option] = texts
+        if option == "--file":
+            raise KeyboardInterrupt  # before any work
+
+    monkeypatch.setattr(denoise.settings, "choose_method", choose_method)
+    monkeypatch.setattr(denoise.settings, "assignments", assignments)
+
+    def run(text, *arguments):
+        (tmp_path / "svgf-jax.toml").write_text(text)
+        with pytest.raises(SystemExit):
+            cli.main(["denoise", "shot", "-o", "out", *arguments])
+        return told
+
+    return run
+
+
+def test_the_file_stands_behind_the_command_line(chosen, capsys):
+    text = '[denoise]\npreset = "falcor"\nset = { alpha = 0.3, sigma_normal = [1, 2], taa = true }\npng = true\n'
+    told = chosen(text + 'channel = ["albedo=a,b,c"]\n')
+    assert (told["method"], told["preset"], told["set"]) == (
+        "svgf",
+        "falcor",
+        ("alpha=0.3", "sigma_normal=1,2", "taa=true"),
+    )
+    assert told["--channel"] == ("albedo=a,b,c",)
+    assert "svgf-jax.toml: preset, set, png, channel" in capsys.readouterr().err
+    told = chosen(text, "--preset", "paper", "--set", "alpha=0.9")
+    assert (told["preset"], told["set"]) == ("paper", ("alpha=0.9",))
+    assert "svgf-jax.toml: png\n" in capsys.readouterr().err
+    assert chosen(text, "--params", "mine.toml")["preset"] is None  # would exclude each other
+    assert chosen(text, "--config", "none")["preset"] is None
+    (Path.cwd() / "other.toml").write_text('[denoise]\npreset = "tuned"\n')
+    assert chosen(text, "--config", "other.toml")["preset"] == "tuned"
+
+
+def test_the_nearest_file_above_is_taken(tmp_path):
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    assert nearest(tmp_path / "a" / "b") is None
+    (tmp_path / "svgf-jax.toml").touch()
+    assert nearest(tmp_path / "a" / "b") == tmp_path / "svgf-jax.toml"
+    (tmp_path / "a" / "svgf-jax.toml").touch()
+    assert nearest(tmp_path / "a" / "b") == tmp_path / "a" / "svgf-jax.toml"
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("[denoise]\n\npgn = true", "svgf-jax.toml:3: denoise has no option 'pgn'. Did you mean png?"),
+        ("[denoise]\npng = 1", "svgf-jax.toml:2: png = 1; wanted true or false"),
+        ("[denoise]\npreset = true", "svgf-jax.toml:2: preset = true; wanted one text or number"),
+        ("[denoise]\npreset = ['a', 'b']", "svgf-jax.toml:2: preset = a,b; wanted one text or number"),
+        ("[denoise]\nset = false", "svgf-jax.toml:2: set = false; wanted a list or a table"),
+        ("[denoise]\nfps = 'fast'", "svgf-jax.toml:2: unable to convert"),
+        ("[denoise]\nmissing = 'skip'", 'svgf-jax.toml:2. Choose from: "error"'),
+        ("[denois]\n", "svgf-jax.toml:1: got 'denois'"),
+        ("png = true", "svgf-jax.toml:1: got 'png'; wanted a table for each command"),
+        ("[denoise]\npng = yes", "svgf-jax.toml:2: not TOML"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_line(text, complaint, chosen, capsys):
+    chosen(text)
+    assert complaint in capsys.readouterr().err
+
+
+def test_a_file_that_was_asked_for_must_be_there(chosen, capsys):
+    chosen("", "--config", "no.toml")
+    assert "no.toml: no such project file" in capsys.readouterr().err
+
+
+def test_the_tables_of_the_tuner_are_left_to_it(chosen):
+    assert chosen("[tune]\nnonsense = 3\n")["preset"] is None
+    assert "tune" in project.OTHERS
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_gets_its_completion(shell, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["completion", shell, "--config", "none"])
+    script = capsys.readouterr().out
+    assert end.value.code == 0
+    assert all(
+        word in script
+        for word in ("svgf-jax", "denoise", "--checkpoint-every" if shell != "fish" else "checkpoint-every")
+    )
