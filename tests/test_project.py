@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from svgf_jax import cli
-from svgf_jax.commands import denoise, project
+from svgf_jax.commands import denoise
 from svgf_jax.commands.project import nearest
+from tune.__main__ import main as tune
 
 ROOT = Path(__file__).parents[1]
 
@@ -91,9 +92,22 @@ def test_a_file_that_was_asked_for_must_be_there(chosen, capsys):
     assert "no.toml: no such project file" in capsys.readouterr().err
 
 
-def test_the_tables_of_the_tuner_are_left_to_it(chosen):
-    assert chosen("[tune]\nnonsense = 3\n")["preset"] is None
-    assert "tune" in project.OTHERS
+def test_the_table_of_the_tuner_is_the_tuners(tmp_path, monkeypatch, capsys):
+    def said(text, *arguments):
+        (tmp_path / "svgf-jax.toml").write_text(text)
+        with pytest.raises(SystemExit):
+            tune(["noisy", "-o", "p.toml", *arguments])
+        return capsys.readouterr().err
+
+    monkeypatch.chdir(tmp_path)
+    text = '[tune]\nreference = ["refs"]\nmax-steps = 0\n[denoise]\npng = true\n'
+    assert "--max-steps 0" in said(text)
+    assert "--prior -1" in said(text, "--max-steps", "3", "--prior", "-1")
+    assert "svgf-jax.toml:2: tune has no option 'max_steps'. Did you mean max-steps?" in said("[tune]\nmax_steps = 3\n")
+
+
+def test_the_table_of_the_tuner_is_no_error_elsewhere(chosen):
+    assert chosen("[tune]\nmax-steps = 3\n")["method"] == "svgf"
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

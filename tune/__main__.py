@@ -2,11 +2,12 @@
 
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Annotated, Any, NoReturn
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, Group, Parameter
 
 from svgf_jax import SvgfError, __version__
+from svgf_jax.commands.project import use_project
 from tune.command import command
 
 app = App(
@@ -19,10 +20,27 @@ app = App(
 app.default(command)
 
 
+@app.meta.default
+def launch(
+    *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
+    config: Annotated[str, Parameter(metavar="FILE", group=Group("Project", sort_key=9))] = "auto",
+) -> Any:
+    """Run with the project's file behind the command line.
+
+    Args:
+        config: Flags of this project, its table [tune]; auto takes the nearest svgf-jax.toml, none ignores it.
+    """
+    use_project(app, config, table="tune")
+    try:
+        return app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+    finally:
+        app.config = ()
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run and exit: 0; 1 if a validation sequence got worse; 2 for an error that its message explains; 130 interrupted."""
     try:
-        code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+        code = app.meta(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
         fail(f"{str(error).strip()} See `svgf-tune --help`.")
     except SvgfError as error:

@@ -27,8 +27,10 @@ APART = (frozenset({"preset", "params", "method"}), frozenset({"resume", "overwr
 """Options that do not go together: one on the command line takes the others of the file away."""
 
 
-def use_project(app: App, given: str, *, tables: Collection[str]) -> None:
+def use_project(app: App, given: str, *, tables: Collection[str] = (), table: str | None = None) -> None:
     """Let the project file stand behind the command line of `app`: `given`, "none", or "auto" = the nearest one.
+
+    `tables` are those that there may be, if anyone knows; `table` is the one of an app that has no commands.
 
     Raises SvgfError: not there, not TOML, a table of no command.
     """
@@ -37,12 +39,12 @@ def use_project(app: App, given: str, *, tables: Collection[str]) -> None:
         return
     file = read_toml(path, "project file")
     for name, value in file.content.items():
-        if name not in tables or not isinstance(value, dict):
+        if (tables and name not in tables) or not isinstance(value, dict):
             raise SvgfError(
                 f"{place(file, name)}: got {name!r}; wanted a table for each command: "
-                f"{', '.join(f'[{table}]' for table in tables)}{suggest(name, tables)}"
+                f"{', '.join(f'[{known}]' for known in tables)}{suggest(name, tables)}"
             )
-    app.config = (partial(_apply, file),)
+    app.config = (partial(_apply, file, () if table is None else (table,)),)
 
 
 def nearest(folder: Path) -> Path | None:
@@ -50,9 +52,12 @@ def nearest(folder: Path) -> Path | None:
     return next((path for above in (folder, *folder.parents) if (path := above / NAME).is_file()), None)
 
 
-def _apply(file: TomlFile, _: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
+def _apply(
+    file: TomlFile, above: tuple[str, ...], _: App, commands: tuple[str, ...], arguments: ArgumentCollection
+) -> None:
     """Give every option that the command line leaves open what the file says, and tell which."""
     table: Any = file.content
+    commands = (*above, *commands)
     for command in commands:
         table = table.get(command, {}) if isinstance(table, dict) else {}
     options = {name[2:]: argument for argument in arguments for name in argument.names if name.startswith("--")}
