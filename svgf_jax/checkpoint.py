@@ -1,15 +1,17 @@
 """What a run keeps in its output folder so that it can be resumed: a lock, its identity, the history. No JAX.
 
 All of it lies in `OUT/.svgf-jax/`: `lock` (held by the operating system for as long as the process lives), `run.json`
-(what is being computed: parameters, inputs, options) and `checkpoint.npz` (the history after so many frames). Every
-file is replaced atomically and carries data only; nothing in it is ever executed.
+(what is being computed: parameters, inputs, options), `checkpoint.npz` (the history after so many frames) and
+`frames.jsonl` (a line for each frame that was done: its time, repairs, mean history length). The first three are
+replaced atomically, the last grows. They carry data only; nothing in them is ever executed.
 """
 
+import contextlib
 import json
 import os
 import socket
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -143,6 +145,32 @@ def check_same(out: Path, saved: Identity, identity: Identity, *, used: int) -> 
             raise SvgfError(f"{head}its input frame {index + 1} was {then}, and is {now} now.{tail}")
     for key, then, now in _differences(saved, identity):
         raise SvgfError(f"{head}{key} was {then}, and is {now} now.{tail}")
+
+
+def append_figures(out: Path, figures: Mapping[str, Any]) -> None:
+    """Note what is known of one frame that is done; its "number" says which. Raises SvgfError."""
+    path = out / FOLDER / "frames.jsonl"
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(dict(figures), default=str) + "\n")
+    except OSError as error:
+        raise SvgfError(f"Could not write {path}: {error}. Check that the disk is not full.") from error
+
+
+def load_figures(out: Path) -> dict[int, dict[str, Any]]:
+    """What is known of the frames by number, the latest of each; a line that is cut off or damaged counts for nothing."""
+    found: dict[int, dict[str, Any]] = {}
+    with contextlib.suppress(OSError, UnicodeDecodeError):
+        for line in (out / FOLDER / "frames.jsonl").read_text(encoding="utf-8").splitlines():
+            with contextlib.suppress(ValueError, KeyError, TypeError):
+                figures = json.loads(line)
+                found[int(figures["number"])] = figures
+    return found
+
+
+def remove_figures(out: Path) -> None:
+    """Forget them: another run begins."""
+    (out / FOLDER / "frames.jsonl").unlink(missing_ok=True)
 
 
 def remove_checkpoint(out: Path) -> None:

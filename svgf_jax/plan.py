@@ -52,15 +52,19 @@ def make_plan(
             f"Frame {files[0][0]} is missing, and there is none before it whose output could be held. "
             "Begin with a frame that is there (--frames), or use --missing reset."
         )
-    names = _output_names(files, hold=hold)
-    planned = tuple(None if name is None else out / name for name in names)
+    planned = output_paths(files, out, hold=hold)
     inputs = {os.path.realpath(path) for _, path in files if path is not None}
     for path in planned:
         if path is not None and os.path.realpath(path) in inputs:
             raise SvgfError(f"The output {path} would replace an input. Choose another output folder.")
-    film = out / (_stem(next((name for name in names if name), "")) + ".mp4") if video else None
+    film = out / (_stem(next((path.name for path in planned if path), "")) + ".mp4") if video else None
     stamps = [[files[i][0], *(stamp(sequence[i][1]) for sequence in (files, *others))] for i in range(len(files))]
     return Plan(out, files, planned, png, film, identity | {"frames": stamps})
+
+
+def output_paths(files: Files, out: Path, *, hold: bool) -> tuple[Path | None, ...]:
+    """The file that each frame of a run is written to; None for a missing one that is not held."""
+    return tuple(None if name is None else out / name for name in _output_names(files, hold=hold))
 
 
 def begin(plan: Plan, *, resume: bool, overwrite: bool) -> Checkpoint | None:
@@ -107,6 +111,7 @@ def _start(plan: Plan, *, overwrite: bool) -> Checkpoint:
             f"unasked. Choose another output folder, or: {hint}--overwrite replaces them."
         )
     checkpoint.remove_checkpoint(plan.out)
+    checkpoint.remove_figures(plan.out)
     return Checkpoint(0, None)
 
 

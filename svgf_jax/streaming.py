@@ -35,6 +35,9 @@ class FrameReport(NamedTuple):
         counts: pixels repaired on loading, before filtering and on writing, by reason, and those of the output that are
             `not_finite`, which should never happen; only those above 0.
         notes: anything else worth telling, as sentences.
+        history: mean history length of its surfaces in frames; None if there are none, or nothing was filtered.
+        seconds: since the frame before was complete, or since the run began: reading, filtering and writing, which
+            overlap, and for the first the compilation too.
     """
 
     number: int
@@ -42,6 +45,8 @@ class FrameReport(NamedTuple):
     path: Path | None
     counts: dict[str, int]
     notes: tuple[str, ...]
+    history: float | None = None
+    seconds: float = 0.0
 
 
 class Summary(NamedTuple):
@@ -89,6 +94,7 @@ def run(
     checkpoint_every: int = 8,
     threads: int = 2,
     on_frame: Callable[[FrameReport], None] = lambda report: None,
+    on_output: Callable[[frames.LoadedFrame, Output], None] = lambda item, output: None,
     stop: Callable[[], bool] = lambda: False,
     pipeline: Pipeline | None = None,
 ) -> Summary:
@@ -108,6 +114,8 @@ def run(
         device: "cpu", "gpu", "gpu:1", ...; None takes JAX's default.
         threads: frames read ahead, and outputs written behind.
         on_frame: called in this thread for each frame once its output is complete, in order.
+        on_output: called in a background thread with each filtered frame and its output, NumPy arrays, before that is written;
+            frames may come in another order.
         stop: asked after each frame; True ends the run with a checkpoint.
         pipeline: `(init, step)` in place of the library's.
 
@@ -140,8 +148,14 @@ def run(
     notes: list[str] = []
     device_name: list[str] = []
 
+    complete_at = began
+
     def done(report: FrameReport | None) -> None:
+        nonlocal complete_at
         if report is not None:
+            now = time.monotonic()
+            report, complete_at = report._replace(seconds=now - complete_at), now
+            checkpoint.append_figures(plan.out, report._asdict())
             statuses[report.status] += 1
             counts.update(report.counts)
             notes[:] = frames.told_once([*notes, *report.notes])
@@ -157,7 +171,7 @@ def run(
         end = len(plan.files)
         if start is not None:
             read = partial(_read, source)
-            write = partial(_write, source, plan, options, provenance)
+            write = partial(_write, source, plan, options, provenance, on_output)
             loaded = read_ahead(read, range(start.next_index, end), threads=threads)
             with write_behind(done, threads=threads) as submit, contextlib.closing(loaded):
                 end = _filter(plan, start, loaded, filters, write, submit, stop, checkpoint_every)
@@ -261,6 +275,7 @@ def _write(
     plan: Plan,
     options: WriteOptions,
     provenance: Mapping[str, str],
+    on_output: Callable[[frames.LoadedFrame, Output], None],
     index: int,
     item: frames.LoadedFrame,
     output: Output,
@@ -269,6 +284,7 @@ def _write(
     path = plan.outputs[index]
     assert path is not None
     output = to_host(output, item.path)
+    on_output(item, output)
     image, clipped = outputs.compose(
         output, item.image, options=options, signals=source.roles.signals, attributes=provenance
     )
@@ -280,7 +296,9 @@ def _write(
     broken = int(np.count_nonzero(~np.isfinite(output.image).all(axis=-1)))
     rejected = {name: int(count) for name, count in output.rejected._asdict().items()}
     counts = Counter(item.counts) + Counter(rejected) + Counter(clipped=clipped, not_finite=broken)
-    return FrameReport(plan.files[index][0], "filtered", path, dict(counts), tuple(notes))
+    lengths = output.history_length[output.history_length > 0]
+    history = float(np.mean(lengths)) if lengths.size else None
+    return FrameReport(plan.files[index][0], "filtered", path, dict(counts), tuple(notes), history)
 
 
 def _fill_gap(plan: Plan, index: int) -> FrameReport:
