@@ -19,6 +19,7 @@ M1' = g M1 + o; the variance M2 - M1^2 scales with the square of the light and t
 Nothing here is in Schied et al. 2017; the gradient's normalisation is that of A-SVGF (Schied et al. 2018) in other clothes.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -28,7 +29,7 @@ from jax import Array, lax
 
 from svgf_jax.color import largest_luminance, luminance_of_planes
 from svgf_jax.edges import Guides, depth_gradient, geometry_exponent, guides_of
-from svgf_jax.sampling import planes, square_offsets, sum_over_taps
+from svgf_jax.sampling import in_strips, planes, square_offsets, sum_over_taps
 from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
 
 GAIN_LEVELS = 3  # a-trous levels on the grid of cells: reach of +-14 cells
@@ -56,12 +57,12 @@ class Cells(NamedTuple):
     square: Array
 
 
-class Means(NamedTuple):
-    """Weighted means over the pixels of a cell, of one signal.
+class Sums(NamedTuple):
+    """Weighted sums over the pixels of a cell, of one signal.
 
     Attributes:
         current, previous: color of this frame and of the history.
-        current2, product, previous2: means of l^2, l prev_l and prev_l^2, for the luminances l and prev_l.
+        current2, product, previous2: of l^2, l prev_l and prev_l^2, for the luminances l and prev_l.
     """
 
     current: Color
@@ -69,6 +70,19 @@ class Means(NamedTuple):
     current2: Array
     product: Array
     previous2: Array
+
+
+class Compared(NamedTuple):
+    """Weighted sums again, with the history corrected by what is known so far.
+
+    Attributes:
+        current, previous: color of this frame and of the corrected history.
+        square: of the squared difference of their luminances.
+    """
+
+    current: Color
+    previous: Color
+    square: Array
 
 
 class Correction(NamedTuple):
@@ -100,7 +114,8 @@ def follow_light(
         config: `light_cell` = 0 leaves the history as it is.
 
     Returns:
-        `previous` with other illumination and moments; pixels without history, and those unlike any cell near, are unchanged.
+        `previous` with other illumination and moments, and with the change that this made; pixels without history, and those
+        unlike any cell near, are unchanged.
     """
     size = config.light_cell
     if size == 0:
@@ -115,13 +130,15 @@ def follow_light(
     history = tuple(split(planes(signal)) for signal in previous.illumination)
     moments = tuple(split(planes(signal)) for signal in previous.moments)
 
-    cells, means = _gather(guides, slope, known, current, history, size=size, scalars=scalars)
-    corrections = _judge(cells, means, size=size, scalars=scalars)
-    history, moments = _apply(cells, corrections, guides, slope, known, history, moments, size=size, scalars=scalars)
+    cells, sums = _gather(guides, slope, known, current, history, size=size, scalars=scalars)
+    corrections = _judge(cells, sums, size=size, scalars=scalars)
+    corrected = _apply(cells, corrections, guides, slope, known, history, moments, size=size, scalars=scalars)
+    history, moments, change = zip(*corrected, strict=True)
     join = lambda phases: _unphase(phases, size, height, width)  # noqa: E731
     return previous._replace(
         illumination=jnp.stack([jnp.stack([join(c) for c in signal], axis=-1) for signal in history]),
         moments=jnp.stack([jnp.stack([join(m) for m in signal], axis=-1) for signal in moments]),
+        change=jnp.stack([join(signal) for signal in change]),
     )
 
 
@@ -157,8 +174,8 @@ def _weight(p: Guides, q: Guides, slope: tuple[Array, Array], dy: Array, dx: Arr
     return p.surface * q.surface * jnp.exp(exponent)
 
 
-def _gather(guides, slope, known, current, history, *, size: int, scalars: Params) -> tuple[Cells, tuple[Means, ...]]:
-    """Means over the cells' own pixels, weighted by likeness to the central one."""
+def _gather(guides, slope, known, current, history, *, size: int, scalars: Params) -> tuple[Cells, tuple[Sums, ...]]:
+    """Sums over the cells' own pixels, weighted by likeness to the central one."""
     centre = (size // 2) * (size + 1)
     cell_guides, cell_slope = jax.tree.map(lambda a: a[centre], (guides, slope))
     distance = jnp.asarray(_from_centre(size), known.dtype)
@@ -167,100 +184,110 @@ def _gather(guides, slope, known, current, history, *, size: int, scalars: Param
         q, with_history, colors, (dy, dx) = phase
         weight = with_history * _weight(cell_guides, q, cell_slope, dy, dx, scalars)
         weights, squares, totals = sums
-        values = tuple(_moments_of(*pair) for pair in colors)
+        values = tuple(_compare(*pair) for pair in colors)
         totals = jax.tree.map(lambda total, value: total + weight * value, totals, values)
         return (weights + weight, squares + weight * weight, totals), None
 
     colors = tuple(zip(current, history, strict=True))
     zero = jnp.zeros(known.shape[1:], known.dtype)
-    nothing = tuple(Means((zero,) * 3, (zero,) * 3, zero, zero, zero) for _ in colors)
+    nothing = tuple(Sums((zero,) * 3, (zero,) * 3, zero, zero, zero) for _ in colors)
     (weight, square, totals), _ = lax.scan(
         jax.checkpoint(add, prevent_cse=False),  # type: ignore[arg-type]
         (zero, zero, nothing),
         (guides, known, colors, (distance[:, 0], distance[:, 1])),
     )
-    divisor = jnp.where(weight > _TINY, weight, 1.0)
-    return Cells(cell_guides, cell_slope, weight, square), jax.tree.map(lambda total: total / divisor, totals)
+    return Cells(cell_guides, cell_slope, weight, square), totals
 
 
-def _moments_of(current: Color, history: Color) -> Means:
+def _compare(current: Color, history: Color) -> Sums:
     current, history = jax.tree.map(lambda c: jnp.minimum(c, largest_luminance(c.dtype)), (current, history))
     l, prev_l = luminance_of_planes(*current), luminance_of_planes(*history)  # noqa: E741
-    return Means(current, history, l * l, l * prev_l, prev_l * prev_l)
+    return Sums(current, history, l * l, l * prev_l, prev_l * prev_l)
 
 
-def _judge(cells: Cells, means: tuple[Means, ...], *, size: int, scalars: Params) -> tuple[Correction, ...]:
+def _judge(cells: Cells, sums: tuple[Sums, ...], *, size: int, scalars: Params) -> tuple[Correction, ...]:
     """Steps 1 and 2 of the module's docstring, on the grid of cells."""
     ones, zeros = jnp.ones_like(cells.weight), jnp.zeros_like(cells.weight)
-    start = tuple(Correction((ones,) * 3, (zeros,) * 3, ones, ones, zeros) for _ in means)
-    wide, effective = _pool(cells, _compared(means, start), levels=GAIN_LEVELS, size=size, scalars=scalars)
-    with_gain = []
+    start = tuple(Correction((ones,) * 3, (zeros,) * 3, ones, ones, zeros) for _ in sums)
+    wide = _pool(cells, in_strips(_correct_sums, sums, start), levels=GAIN_LEVELS, size=size, scalars=scalars)
+    gains = in_strips(partial(_gains, threshold=scalars.light_gain_threshold), *wide)
+    narrow = _pool(cells, in_strips(_correct_sums, sums, gains), levels=OFFSET_LEVELS, size=size, scalars=scalars)
+    return in_strips(partial(_offsets, threshold=scalars.light_offset_threshold), *narrow, gains)
+
+
+def _gains(effective: Array, wide: tuple[Compared, ...], *, threshold) -> tuple[Correction, ...]:
+    out = []
     for current, previous, square in wide:
-        significance, _ = _significance(current, previous, square, effective, scalars.light_gain_threshold)
+        significance, _ = _significance(current, previous, square, effective, threshold)
         scale = luminance_of_planes(*previous)
         luminance_gain = _ratio(luminance_of_planes(*current), scale, scale, significance)
         gain = tuple(_ratio(c, p, scale, significance) for c, p in zip(current, previous, strict=True))
-        keep = (1.0 - significance) * luminance_gain**2
-        with_gain.append(Correction(gain, (zeros,) * 3, luminance_gain, keep, significance))
-    narrow, effective = _pool(cells, _compared(means, with_gain), levels=OFFSET_LEVELS, size=size, scalars=scalars)
-    return tuple(
-        _with_offset(before, current, previous, square, effective, scalars.light_offset_threshold)
-        for before, (current, previous, square) in zip(with_gain, narrow, strict=True)
-    )
-
-
-def _with_offset(before: Correction, current: Color, previous: Color, square: Array, effective: Array, threshold):
-    significance, observed = _significance(current, previous, square, effective, threshold)
-    offset = tuple(significance * (c - p) for c, p in zip(current, previous, strict=True))
-    either = 1.0 - (1.0 - before.variance) * (1.0 - significance)  # until here `variance` held the gain's significance
-    scale = luminance_of_planes(*previous)
-    grown = _ratio(luminance_of_planes(*current), scale, scale, significance)
-    keep = before.keep * (1.0 - significance) * grown**2
-    return before._replace(offset=offset, keep=keep, variance=either * observed)
-
-
-def _compared(means: tuple[Means, ...], corrections) -> tuple:
-    """Per signal: the cells' current and corrected previous color, and the mean square of their luminances' difference."""
-    out = []
-    for mean, c in zip(means, corrections, strict=True):
-        previous = tuple(g * p for g, p in zip(c.gain, mean.previous, strict=True))
-        square = mean.current2 - 2.0 * c.luminance_gain * mean.product + c.luminance_gain**2 * mean.previous2
-        out.append((mean.current, previous, jnp.maximum(square, 0.0)))
+        nothing = (jnp.zeros_like(scale),) * 3
+        # Until the offset is known, `variance` holds the gain's significance.
+        out.append(Correction(gain, nothing, luminance_gain, (1.0 - significance) * luminance_gain**2, significance))
     return tuple(out)
 
 
-def _pool(cells: Cells, values, *, levels: int, size: int, scalars: Params) -> tuple:
-    """Means of `values` over ever wider neighbourhoods of cells, and 1 / (effective number of pixels) of these means."""
-    totals = jax.tree.map(lambda value: value * cells.weight, values)
-    state = (cells.weight, cells.square, totals)
+def _offsets(effective: Array, narrow: tuple[Compared, ...], gains, *, threshold) -> tuple[Correction, ...]:
+    out = []
+    for (current, previous, square), before in zip(narrow, gains, strict=True):
+        significance, observed = _significance(current, previous, square, effective, threshold)
+        offset = tuple(significance * (c - p) for c, p in zip(current, previous, strict=True))
+        either = 1.0 - (1.0 - before.variance) * (1.0 - significance)
+        scale = luminance_of_planes(*previous)
+        grown = _ratio(luminance_of_planes(*current), scale, scale, significance)
+        keep = before.keep * (1.0 - significance) * grown**2
+        out.append(before._replace(offset=offset, keep=keep, variance=either * observed))
+    return tuple(out)
+
+
+def _correct_sums(sums: tuple[Sums, ...], corrections: tuple[Correction, ...]) -> tuple[Compared, ...]:
+    out = []
+    for s, c in zip(sums, corrections, strict=True):
+        previous = tuple(g * p for g, p in zip(c.gain, s.previous, strict=True))
+        square = s.current2 - 2.0 * c.luminance_gain * s.product + c.luminance_gain**2 * s.previous2
+        out.append(Compared(s.current, previous, jnp.maximum(square, 0.0)))
+    return tuple(out)
+
+
+def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, scalars: Params):
+    """1 / (effective number of pixels) of ever wider neighbourhoods of cells, and the means over them."""
     kernel = np.outer([1, 4, 6, 4, 1], [1, 4, 6, 4, 1]).reshape(-1) / 256.0
-    for level in range(levels):
-        offsets = _OFFSETS * 2**level
-        distance = jnp.asarray(offsets * size, cells.weight.dtype)
+    away = jnp.asarray(_OFFSETS * size, cells.weight.dtype)
 
-        def tap(sums, q, p, t):
-            dy, dx, h = t
-            weight = h * _weight(p["guides"], q["guides"], p["slope"], dy, dx, scalars)
-            weights, squares, totals = q["state"]
-            return (
-                sums[0] + weight * weights,
-                sums[1] + weight * weight * squares,
-                jax.tree.map(lambda s, v: s + weight * v, sums[2], totals),
-            )
+    def tap(sums, q, p, t):
+        dy, dx, h = t
+        weight = h * _weight(p["guides"], q["guides"], p["slope"], dy, dx, scalars)
+        weights, squares, totals = q["state"]
+        return (
+            sums[0] + weight * weights,
+            sums[1] + weight * weight * squares,
+            jax.tree.map(lambda s, v: s + weight * v, sums[2], totals),
+        )
 
-        state = sum_over_taps(
+    def level(state, step_size: Array):
+        distance = away * step_size.astype(away.dtype)
+        return sum_over_taps(
             tap,
             lambda sums, p: sums,
             neighbours={"guides": cells.guides, "state": state},
             centre={"guides": cells.guides, "slope": cells.slope},
-            offsets=offsets,
-            per_tap=(distance[:, 0], distance[:, 1], jnp.asarray(kernel, cells.weight.dtype)),
+            offsets=_OFFSETS,
+            per_tap=(distance[:, 0], distance[:, 1], jnp.asarray(kernel, away.dtype)),
             sums=jax.tree.map(lambda a: jnp.zeros((), a.dtype), state),
-        )
-    weight, square, totals = state
-    some = weight > _TINY
-    divisor = jnp.where(some, weight, 1.0)
-    return jax.tree.map(lambda t: t / divisor, totals), jnp.where(some, square / divisor / divisor, 1.0)
+            step_size=step_size,
+            largest_step=2 ** (levels - 1),
+        ), None
+
+    state, _ = lax.scan(level, (cells.weight, cells.square, sums), 2 ** jnp.arange(levels, dtype=jnp.int32))
+
+    def means(weight: Array, square: Array, totals):
+        some = weight > _TINY
+        divisor = jnp.where(some, weight, 1.0)
+        effective = jnp.where(some, square / divisor / divisor, 1.0)
+        return effective, jax.tree.map(lambda t: jnp.where(some, t / divisor, 0.0), totals)
+
+    return in_strips(means, *state)
 
 
 def _significance(current: Color, previous: Color, square: Array, effective: Array, threshold) -> tuple[Array, Array]:
@@ -311,11 +338,10 @@ def _apply(cells: Cells, corrections, guides, slope, known, history, moments, *,
         found = (weight > 1e-8) & (with_history > 0.0)
         divisor = jnp.where(found, weight, 1.0)
         corrected = [_correct(c, m, t, divisor) for c, m, t in zip(colors, pairs, totals, strict=True)]
-        return jax.tree.map(
-            lambda new, old: jnp.where(found, new, old), tuple(corrected), tuple(zip(colors, pairs, strict=True))
-        )
+        as_it_was = tuple((c, m, zero) for c, m in zip(colors, pairs, strict=True))
+        return jax.tree.map(lambda new, old: jnp.where(found, new, old), tuple(corrected), as_it_was)
 
-    result = lax.map(
+    return lax.map(
         jax.checkpoint(pixel, prevent_cse=False),  # type: ignore[arg-type]
         (
             guides,
@@ -328,7 +354,6 @@ def _apply(cells: Cells, corrections, guides, slope, known, history, moments, *,
             distance,
         ),
     )
-    return tuple(color for color, _ in result), tuple(pair for _, pair in result)
 
 
 def _correct(color: Color, moments: tuple[Array, Array], total: Correction, divisor: Array):
@@ -340,4 +365,6 @@ def _correct(color: Color, moments: tuple[Array, Array], total: Correction, divi
     first, second = moments
     variance = jnp.minimum(c.keep * jnp.maximum(second - first * first, 0.0) + c.variance, most * most)
     first = jnp.clip(c.luminance_gain * first + luminance_of_planes(*c.offset), 0.0, most)
-    return corrected, (first, variance + first * first)
+    before, after = (jnp.minimum(luminance_of_planes(*rgb), most) for rgb in (color, corrected))
+    change = (after - before) / jnp.maximum(jnp.maximum(after, before), _TINY)
+    return corrected, (first, variance + first * first), change

@@ -96,6 +96,7 @@ def step(
         valid=previous.valid,
         rejected=rejected,
         display=display,
+        change=previous.change,
     )
 
 

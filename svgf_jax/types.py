@@ -92,12 +92,14 @@ class Reprojected(NamedTuple):
         moments: `[S, H, W, 2]`.
         history_length: `[H, W]`, a real number.
         valid: `[H, W]` bool, whether there is history.
+        change: `[S, H, W]`, as in `Output`.
     """
 
     illumination: Array
     moments: Array
     history_length: Array
     valid: Array
+    change: Array | None = None
 
 
 class Rejected(NamedTuple):
@@ -130,6 +132,8 @@ class Output(NamedTuple):
         valid: `[H, W]` bool, whether reprojection found history.
         rejected: counts of repaired pixels.
         display: `[H, W, 3]`, the anti-aliased image on its tone curve, c / (1 + luma); None where `Config.taa` is off.
+        change: `[S, H, W]`, by how much the history's luminance was corrected to this frame's light, as a share of the brighter
+            of the two: 0.5 = doubled, -0.9 = a tenth of it is left, 0 = as it was; None where `Config.light_cell` is 0.
     """
 
     image: Array
@@ -140,6 +144,7 @@ class Output(NamedTuple):
     valid: Array
     rejected: Rejected
     display: Array | None = None
+    change: Array | None = None
 
 
 class Params(NamedTuple):
