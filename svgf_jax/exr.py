@@ -49,13 +49,17 @@ class Image(NamedTuple):
 
 
 class Header(NamedTuple):
-    """What `read_header` tells of a file without decoding it: as `Image`, with pixel types in place of pixels."""
+    """What `read_header` tells of a file without decoding it: as `Image`, with pixel types in place of pixels.
+
+    `compression` is that of the first part, "" if it has no name here.
+    """
 
     channels: dict[str, np.dtype]
     data_window: Window
     display_window: Window
     attributes: dict[str, Any]
     parts: tuple[str, ...]
+    compression: str
 
 
 def new_image(
@@ -75,11 +79,11 @@ def read_header(path: PathName) -> Header:
     parts = read_layout(path)
     _check_parts(path, parts, MAX_PIXELS)
     file = _open(path, header_only=True)
-    names = _merged_names(parts)
-    types = {full: parts[i].channels[name].dtype for (i, name), full in names.items()}
+    types = {full: parts[i].channels[name].dtype for (i, name), full in _merged_names(parts).items()}
     first = parts[0]
     attributes = _attributes(file)
-    return Header(types, first.data_window, first.display_window, attributes, tuple(part.name for part in parts))
+    names = tuple(part.name for part in parts)
+    return Header(types, first.data_window, first.display_window, attributes, names, first.compression)
 
 
 def read(path: PathName, *, max_pixels: int = MAX_PIXELS) -> Image:

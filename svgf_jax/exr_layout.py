@@ -19,6 +19,8 @@ Window = tuple[int, int, int, int]
 
 PathName = str | PathLike[str]
 
+_COMPRESSIONS = dict(enumerate(("none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab")))
+
 _MAGIC = b"\x76\x2f\x31\x01"
 _SINGLE_TILE, _DEEP, _MULTI_PART = 0x200, 0x800, 0x1000
 _PIXEL_TYPES = {0: np.dtype(np.uint32), 1: np.dtype(np.float16), 2: np.dtype(np.float32)}
@@ -34,7 +36,10 @@ class Channel(NamedTuple):
 
 
 class Part(NamedTuple):
-    """One part of a file; `kind` is scanlineimage, tiledimage, deepscanline or deeptile, `chunks` -1 where unknown."""
+    """One part of a file.
+
+    `kind` is scanlineimage, tiledimage, deepscanline or deeptile; `chunks` is -1 and `compression` "" where unknown.
+    """
 
     name: str
     kind: str
@@ -42,6 +47,7 @@ class Part(NamedTuple):
     data_window: Window
     display_window: Window
     chunks: int
+    compression: str
 
 
 def read_layout(path: PathName) -> list[Part]:
@@ -138,6 +144,7 @@ def _part(attributes: dict[str, bytes], flags: int) -> Part:
         data_window=data_window,
         display_window=struct.unpack("<4i", attributes["displayWindow"]),
         chunks=_count_chunks(attributes, kind, data_window),
+        compression=_COMPRESSIONS.get(attributes.get("compression", b"\xff")[0], ""),
     )
 
 

@@ -316,6 +316,16 @@ def _position(
     return position
 
 
+def check_windows(image: exr.Image | exr.Header, path: str, source: Source) -> None:
+    """Raise SvgfError where a file has other windows than the first frame."""
+    if (image.data_window, image.display_window) != (source.data_window, source.display_window):
+        raise SvgfError(
+            f"{path}: data window {image.data_window} of {image.display_window}; wanted {source.data_window} of "
+            f"{source.display_window}, as in the first frame. Render all files in one size, or denoise the parts as "
+            "sequences of their own (--frames)."
+        )
+
+
 def told_once(notes: Iterable[str]) -> tuple[str, ...]:
     """Each note once; of those that only tell another frame's numbers, the first."""
     first: dict[str, str] = {}
@@ -332,12 +342,7 @@ def _origin(source: Source) -> tuple[int, int]:
 
 def _read(path: str, source: Source) -> exr.Image:
     image = exr.read(path, max_pixels=source.max_pixels)
-    if (image.data_window, image.display_window) != (source.data_window, source.display_window):
-        raise SvgfError(
-            f"{path}: data window {image.data_window} of {image.display_window}; wanted {source.data_window} of "
-            f"{source.display_window}, as in the first frame. Render all files in one size, or denoise the parts as "
-            "sequences of their own (--frames)."
-        )
+    check_windows(image, path, source)
     return image
 
 

@@ -68,18 +68,40 @@ def output_paths(files: Files, out: Path, *, hold: bool) -> tuple[Path | None, .
 
 
 def begin(plan: Plan, *, resume: bool, overwrite: bool) -> Checkpoint | None:
-    """Where to start, None if the run is complete already. To be called with the output folder locked.
+    """`find_start`, and the folder made ready: to be called with the output folder locked.
 
-    Records the run in the folder and removes temporary files that a killed one left. Raises SvgfError: outputs exist
-    and neither option is given, the run to resume computed something else or has lost its outputs.
+    Records the run in the folder and removes temporary files that a killed one left.
     """
-    if resume and overwrite:
-        raise SvgfError("Got both resume and overwrite: one continues a run, the other starts it again. Choose one.")
-    start = _resume(plan) if resume else _start(plan, overwrite=overwrite)
+    start = find_start(plan, resume=resume, overwrite=overwrite)
     if start is not None:
+        if start.next_index == 0:
+            checkpoint.remove_checkpoint(plan.out)
+            checkpoint.remove_figures(plan.out)
         _remove_temporary(plan)
         checkpoint.save_run(plan.out, plan.identity, complete=False)
     return start
+
+
+def find_start(plan: Plan, *, resume: bool, overwrite: bool) -> Checkpoint | None:
+    """Where to start, None if the run is complete already. Writes nothing.
+
+    Raises SvgfError: outputs exist and neither option is given, the run to resume computed something else or has lost its
+    outputs.
+    """
+    if resume and overwrite:
+        raise SvgfError("Got both resume and overwrite: one continues a run, the other starts it again. Choose one.")
+    return _resume(plan) if resume else _start(plan, overwrite=overwrite)
+
+
+def check_writable(out: Path) -> None:
+    """Raise SvgfError where the folder `out` could not be made or written into. Writes nothing."""
+    there = next(path for path in (out, *out.absolute().parents) if path.exists())
+    if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+        reason = "not writable" if there.is_dir() else "not a folder"
+        raise SvgfError(
+            f"Cannot write into the output folder {out}: {there} is {reason}. "
+            "Wanted a folder that is writable or can be created; try another one."
+        )
 
 
 def written(plan: Plan, frames: int | None = None) -> Iterator[Path]:
@@ -110,8 +132,6 @@ def _start(plan: Plan, *, overwrite: bool) -> Checkpoint:
             f"{_list(there)} in {plan.out} exist{'s' if len(there) == 1 else ''} already, and nothing is overwritten "
             f"unasked. Choose another output folder, or: {hint}--overwrite replaces them."
         )
-    checkpoint.remove_checkpoint(plan.out)
-    checkpoint.remove_figures(plan.out)
     return Checkpoint(0, None)
 
 

@@ -91,10 +91,10 @@ class Roles(NamedTuple):
     absent: dict[str, str]
     signals: tuple[str, ...]
 
-    def describe(self) -> str:
-        """The mapping in one line a role, for people."""
+    def describe(self, *, absent: bool = True) -> str:
+        """The mapping in one line a role, for people; `absent`: with those that are not there."""
         lines = [f"{role:9} {' '.join(layer.channels)} ({layer.reason})" for role, layer in self.layers.items()]
-        lines += [f"{role:9} not there, taken as {default}" for role, default in self.absent.items()]
+        lines += [f"{role:9} not there, taken as {default}" for role, default in self.absent.items() if absent]
         return "\n".join(lines)
 
 

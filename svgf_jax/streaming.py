@@ -127,21 +127,8 @@ def run(
     began = time.monotonic()
     if checkpoint_every < 1 or threads < 1:
         raise SvgfError(f"Got checkpoint_every {checkpoint_every} and threads {threads}; wanted at least 1 of each.")
-    tonemapping.check_exposure(options.exposure)
-    preview.frame_rate(fps)
-    if video:
-        preview.require_video()
-    provenance = outputs.attributes(
-        os.path.abspath(source.sequence.name), method=method, preset=preset, params=params, config=config
-    )
-    plan = make_plan(
-        source.sequence.files,
-        Path(out),
-        hold=source.sequence.missing == "hold",
-        png=options.png,
-        video=video,
-        identity=_identity(source, options, provenance) | outputs.numbers(params, config),
-        others=[other.files for other in source.files.values()] + _camera_files(source),
+    plan, provenance = prepare(
+        source, out, params=params, config=config, method=method, preset=preset, options=options, video=video, fps=fps
     )
     statuses: Counter[str] = Counter()
     counts: Counter[str] = Counter()
@@ -192,6 +179,38 @@ def run(
         video=plan.video if end == len(plan.files) else None,
         seconds=time.monotonic() - began,
     )
+
+
+def prepare(
+    source: frames.Source,
+    out: str | Path,
+    *,
+    params: Any,
+    config: Config | MethodConfig,
+    method: str,
+    preset: str,
+    options: WriteOptions,
+    video: bool,
+    fps: float,
+) -> tuple[Plan, dict[str, str]]:
+    """What `run` will write, and the attributes that its outputs get. Options, and what is raised, are those of `run`."""
+    tonemapping.check_exposure(options.exposure)
+    preview.frame_rate(fps)
+    if video:
+        preview.require_video()
+    provenance = outputs.attributes(
+        os.path.abspath(source.sequence.name), method=method, preset=preset, params=params, config=config
+    )
+    plan = make_plan(
+        source.sequence.files,
+        Path(out),
+        hold=source.sequence.missing == "hold",
+        png=options.png,
+        video=video,
+        identity=_identity(source, options, provenance) | outputs.numbers(params, config),
+        others=[other.files for other in source.files.values()] + _camera_files(source),
+    )
+    return plan, provenance
 
 
 def _filter(

@@ -352,3 +352,9 @@ def test_a_real_frame(data):
     assert {name: pixels.dtype for name, pixels in image.channels.items()} == header.channels
     assert image.attributes["sequence"] == header.attributes["sequence"] == "cornell-dolly"
     assert image.channels["id.I"].shape == (270, 480)
+
+
+@pytest.mark.parametrize("compression", exr.COMPRESSIONS)
+def test_the_header_tells_the_compression(tmp_path, compression):
+    exr.write(tmp_path / "x.exr", exr.new_image({"Z": ramp()}), compression=compression)
+    assert exr.read_header(tmp_path / "x.exr").compression == compression

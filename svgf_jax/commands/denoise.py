@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Group, Parameter
 
 from svgf_jax.commands import settings, terminal
+from svgf_jax.commands.rehearsal import describe_input, rehearse
 
 if TYPE_CHECKING:
     from svgf_jax.streaming import Summary
@@ -28,6 +29,7 @@ Method = Literal[
     "gaussian",
 ]
 Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab"]
+HEADERS = 200  # of frames that are looked at before a run starts: a fifth of a second
 INPUT, FILTER, OUTPUT, RUN = (Group(name, sort_key=i) for i, name in enumerate(["Input", "Filter", "Output", "Run"]))
 
 
@@ -59,6 +61,7 @@ def denoise(
     overwrite: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     resume: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     checkpoint_every: Annotated[int, Parameter(metavar="FRAMES", group=RUN)] = 8,
+    dry_run: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     json: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     verbose: Annotated[bool, Flag, Parameter(name=["--verbose", "-v"], group=RUN)] = False,
 ) -> int:
@@ -90,8 +93,9 @@ def denoise(
         overwrite: Replace outputs that exist.
         resume: Continue an interrupted run where its last checkpoint is; the result is the same bit for bit.
         checkpoint_every: Save the history for --resume after so many frames.
+        dry_run: Check everything, tell what would be done and about what it would take, and write nothing.
         json: Print a summary as JSON to the standard output; all else goes to the standard error.
-        verbose: Also tell which channel plays which role, the parameters and the device.
+        verbose: Also tell what is not there, the parameters and the device.
     """
     changes = (*set_, "taa=true") if taa else set_
     chosen_preset, chosen, config = settings.choose_method(method, preset, params, changes)
@@ -101,6 +105,7 @@ def denoise(
     from svgf_jax import streaming
     from svgf_jax.frames import open_source
     from svgf_jax.outputs import WriteOptions, numbers
+    from svgf_jax.scan import require_sound, scan_files
 
     source = open_source(
         input_,
@@ -111,13 +116,32 @@ def denoise(
         cameras=None if cameras == "none" else cameras,
         position=getattr(config, "filter", "") == "joint-bilateral",
     )
+    scan = scan_files(source, most=None if dry_run else HEADERS)
+    require_sound(scan)
+    terminal.tell(describe_input(source))
+    terminal.tell(source.roles.describe(absent=verbose))
     terminal.warn(source.warnings)
     if verbose:
-        terminal.tell(f"input: {source.sequence.name}, {len(source.sequence.files)} frames")
-        terminal.tell(source.roles.describe())
         values = numbers(chosen, config)
         listed = ", ".join(f"{name} {value}" for name, value in (values["parameters"] | values["config"]).items())
         terminal.tell(f"{'preset' if method == 'svgf' else 'method'} {chosen_preset}: {listed}")
+    options = WriteOptions(float_, compression, only_denoised, diagnostics, png, exposure, tonemap)
+    if dry_run:
+        plan, _ = streaming.prepare(
+            source,
+            out,
+            params=chosen,
+            config=config,
+            method=method,
+            preset=chosen_preset,
+            options=options,
+            video=video,
+            fps=fps,
+        )
+        told = rehearse(source, scan, plan, config=config, options=options, resume=resume, overwrite=overwrite)
+        if json:
+            terminal.print_json(told | {"method": method, "preset": chosen_preset} | numbers(chosen, config))
+        return 0
     with _until_interrupted() as interruption, terminal.progress(len(source.sequence.files)) as on_frame:
         summary = streaming.run(
             source,
@@ -126,7 +150,7 @@ def denoise(
             config=config,
             method=method,
             preset=chosen_preset,
-            options=WriteOptions(float_, compression, only_denoised, diagnostics, png, exposure, tonemap),
+            options=options,
             video=video,
             fps=fps,
             resume=resume,

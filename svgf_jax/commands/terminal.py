@@ -44,6 +44,27 @@ def repairs(counts: Mapping[str, int]) -> list[str]:
     return [f"{count} pixel{'s' * (count != 1)} {REPAIRS.get(reason, reason)}" for reason, count in counts.items()]
 
 
+def count(number: int, noun: str) -> str:
+    """`1 frame`, `2 frames`."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
+def size(amount: float) -> str:
+    """Bytes for people: `5.2 MB`."""
+    units = ("bytes", "kB", "MB", "GB", "TB")
+    power = min(int(math.log10(max(amount, 1)) / 3), len(units) - 1)
+    amount /= 1000**power
+    return f"{amount:.0f} {units[power]}" if amount >= 100 else f"{amount:.3g} {units[power]}"
+
+
+def duration(seconds: float) -> str:
+    """A time for people: `40 s`, `3 min`, `2 h 5 min`."""
+    if seconds < 90:
+        return f"{max(seconds, 1):.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
+
+
 def print_json(value: Any) -> None:
     """`value` as JSON on the standard output."""
     print(to_json(value))
