@@ -100,8 +100,13 @@ def flip(image: np.ndarray, reference: np.ndarray) -> float:
     _check_shapes(image, reference)
     if np.isnan(image).any() or np.isnan(reference).any():
         return float("nan")
-    _, mean, _ = _flip_evaluator().evaluate(_for_flip(reference), _for_flip(image), "HDR", applyMagma=False)
-    return float(mean)
+    return float(_flip(image, reference)[1])
+
+
+def flip_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """HDR-FLIP of each pixel `[H, W]` in [0, 1], as `flip`; nan counts as 0 here."""
+    _check_shapes(image, reference)
+    return np.asarray(_flip(image, reference)[0])[..., 0]
 
 
 def require_flip() -> None:
@@ -115,19 +120,20 @@ def score(
     *,
     previous: tuple[np.ndarray, np.ndarray] | None = None,
     with_flip: bool = False,
+    with_ssim: bool = True,
 ) -> Scores:
-    """All scores of one frame. `previous` is the previous frame's (image, reference), None for the first."""
+    """The scores of one frame. `previous` is the previous frame's (image, reference), None for the first."""
     return Scores(
         psnr=psnr(image, reference),
         relmse=relmse(image, reference),
-        ssim=ssim(image, reference),
+        ssim=ssim(image, reference) if with_ssim else float("nan"),
         temporal=float("nan") if previous is None else temporal_error(image, previous[0], reference, previous[1]),
         flip=flip(image, reference) if with_flip else float("nan"),
     )
 
 
 def score_frames(
-    pairs: Iterable[tuple[np.ndarray, np.ndarray | None]], *, with_flip: bool = False
+    pairs: Iterable[tuple[np.ndarray, np.ndarray | None]], *, with_flip: bool = False, with_ssim: bool = True
 ) -> Iterator[Scores | None]:
     """The scores of consecutive frames (image, reference), one by one; None for a frame without a reference.
 
@@ -141,7 +147,7 @@ def score_frames(
             continue
         if previous is not None and previous[0].shape != image.shape:
             previous = None
-        yield score(image, reference, previous=previous, with_flip=with_flip)
+        yield score(image, reference, previous=previous, with_flip=with_flip, with_ssim=with_ssim)
         previous = image, reference
 
 
@@ -194,6 +200,11 @@ def _check_shapes(image: np.ndarray, reference: np.ndarray) -> None:
             f"Cannot compare images of shapes {np.shape(image)} and {np.shape(reference)}: "
             "wanted two images of one shape [height, width, channels]."
         )
+
+
+def _flip(image: np.ndarray, reference: np.ndarray) -> tuple:
+    """(map `[H, W, 1]`, mean, what it did)."""
+    return _flip_evaluator().evaluate(_for_flip(reference), _for_flip(image), "HDR", applyMagma=False)
 
 
 def _for_flip(image: np.ndarray) -> np.ndarray:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Group, Parameter
 
-from svgf_jax.commands import settings, terminal
+from svgf_jax.commands import results, settings, terminal
 from svgf_jax.commands.rehearsal import describe_input, rehearse
+from svgf_jax.types import SvgfError
 
 if TYPE_CHECKING:
     from svgf_jax.streaming import Summary
@@ -58,6 +59,8 @@ def denoise(
     fps: Annotated[float, Parameter(group=OUTPUT)] = 24.0,
     exposure: Annotated[float, Parameter(group=OUTPUT)] = 1.0,
     tonemap: Annotated[settings.Tonemap, Parameter(group=OUTPUT)] = "reinhard-extended",
+    report: Annotated[Path | None, Parameter(metavar="FILE.html", group=OUTPUT)] = None,
+    reference: Annotated[str | None, Parameter(metavar="REF", group=OUTPUT)] = None,
     overwrite: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     resume: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     checkpoint_every: Annotated[int, Parameter(metavar="FRAMES", group=RUN)] = 8,
@@ -88,8 +91,10 @@ def denoise(
         png: Also write a tone-mapped PNG of each frame.
         video: Also write an MP4 of the whole (needs the extra `video`).
         fps: Frames per second of the video.
-        exposure: Brightness factor of PNG and video.
-        tonemap: Tone curve of PNG and video.
+        exposure: Brightness factor of PNG, video and report.
+        tonemap: Tone curve of PNG, video and report.
+        report: Also write one page to look at: pictures, maps, curves, and all that was chosen.
+        reference: References for the report, paired by number: it then tells the error too.
         overwrite: Replace outputs that exist.
         resume: Continue an interrupted run where its last checkpoint is; the result is the same bit for bit.
         checkpoint_every: Save the history for --resume after so many frames.
@@ -101,10 +106,15 @@ def denoise(
     chosen_preset, chosen, config = settings.choose_method(method, preset, params, changes)
     roles = settings.assignments(channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
     files = settings.assignments(file, option="--file", example="normal=normal_####.exr")
+    if reference is not None and report is None:
+        raise SvgfError(f"Got --reference {reference} without --report; references are for the report.")
+    results.require_writable((report,), overwrite=overwrite or resume)
 
+    from svgf_jax import report as reports
     from svgf_jax import streaming
     from svgf_jax.frames import open_source
     from svgf_jax.outputs import WriteOptions, numbers
+    from svgf_jax.references import pair_references
     from svgf_jax.scan import require_sound, scan_files
 
     source = open_source(
@@ -126,6 +136,11 @@ def denoise(
         listed = ", ".join(f"{name} {value}" for name, value in (values["parameters"] | values["config"]).items())
         terminal.tell(f"{'preset' if method == 'svgf' else 'method'} {chosen_preset}: {listed}")
     options = WriteOptions(float_, compression, only_denoised, diagnostics, png, exposure, tonemap)
+    shown = None
+    if report is not None:
+        references, lacking = ({}, ()) if reference is None else pair_references(source.sequence, reference)
+        terminal.warn(lacking)
+        shown = reports.Run(source, out, method, chosen_preset, chosen, config, options, references, {})
     if dry_run:
         plan, _ = streaming.prepare(
             source,
@@ -159,8 +174,12 @@ def denoise(
             checkpoint_every=checkpoint_every,
             on_frame=on_frame,
             stop=lambda: bool(interruption),
+            on_output=reports.watch(shown) if shown is not None else lambda item, output: None,
         )
     _conclude(summary, verbose=verbose)
+    if report is not None and shown is not None:
+        results.save(report, reports.run_page(shown, summary, repairs=terminal.repairs))
+        terminal.tell(f"report: {report}")
     if json:
         terminal.print_json(summary._asdict() | {"method": method, "preset": chosen_preset} | numbers(chosen, config))
     if summary.interrupted:

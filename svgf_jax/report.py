@@ -1,0 +1,338 @@
+"""One self-contained page about a run, a comparison or an ablation: pictures, maps, curves, and all that was chosen. No JAX.
+
+Pictures are shown of at most `MOST` frames, evenly spread, and share a budget of bytes, so that a page stays below 15 MB
+however long the sequence is. What is not known of a frame is left out or said to be unknown.
+"""
+
+import importlib.metadata
+import json
+import math
+import platform
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from svgf_jax import __version__, checkpoint, exr, frames, metrics, page
+from svgf_jax.outputs import WriteOptions, beauty, numbers
+from svgf_jax.page import Line, Shown
+from svgf_jax.plan import output_paths
+from svgf_jax.references import read_radiance, read_reference
+from svgf_jax.sequences import format_range
+from svgf_jax.shown import MOST, diagnostic_layers, diagnostics, encoded, legends, longest_history, share, shown_frame
+from svgf_jax.streaming import Summary
+from svgf_jax.types import Output
+
+UNKNOWN = "?"
+
+
+class Run(NamedTuple):
+    """What a report of a run is about.
+
+    Attributes:
+        source, out: the sequence and the output folder.
+        method, preset: by name.
+        params, config: what runs.
+        options: how previews look.
+        references: files by frame number.
+        maps: data URLs of maps by frame number, which `watch` fills.
+    """
+
+    source: frames.Source
+    out: Path
+    method: str
+    preset: str
+    params: Any
+    config: Any
+    options: WriteOptions
+    references: Mapping[int, str]
+    maps: dict[int, Mapping[str, str]]
+
+
+def watch(run: Run) -> Callable[[frames.LoadedFrame, Output], None]:
+    """What `streaming.run(on_output=...)` takes: it keeps the maps of the frames that may be shown."""
+    chosen = page.evenly([number for number, path in run.source.sequence.files if path is not None], MOST)
+
+    def on_output(item: frames.LoadedFrame, output: Output) -> None:
+        if item.number in chosen:
+            layers = (output.variance, output.history_length, output.valid, getattr(output, "change", None))
+            maps = diagnostics(*layers, longest=longest_history(run.params._asdict()))
+            run.maps[item.number] = encoded(maps, share(len(chosen)))
+
+    return on_output
+
+
+def run_page(run: Run, summary: Summary, *, repairs: Callable[[Mapping[str, int]], Iterable[str]]) -> str:
+    """The page about a run, of the frames that are done: reads them back, the references, and the inputs that are shown.
+
+    `repairs` tells in words what the counts of repaired pixels mean.
+    """
+    sequence = run.source.sequence
+    paths = output_paths(sequence.files, run.out, hold=sequence.missing == "hold")
+    figures = checkpoint.load_figures(run.out)
+    done = [
+        (index, number, path)
+        for index, ((number, _), path) in enumerate(zip(sequence.files, paths, strict=True))
+        if path is not None and path.exists() and (number in figures or not summary.interrupted)
+    ]
+    shown, scores = _run_frames(run, done)
+    known = [figures.get(number, {}) for _, number, _ in done]
+    x = [number for _, number, _ in done]
+    seconds = [_number(one.get("seconds")) for one in known]
+    counts = [one.get("counts") for one in known]
+    repaired = [math.nan if one is None else float(sum(one.values())) for one in counts]
+    length = [_number(one.get("history")) for one in known]
+    curves = [
+        *_curves(x, scores, {"denoised": _values(scores, "psnr")} | _noisy_line(shown)),
+        page.plot([Line("seconds", x, seconds)], title="seconds a frame (the first compiles)", frames=x, log=True),
+        page.plot([Line("pixels", x, repaired)], title="pixels repaired", frames=x),
+        page.plot([Line("frames", x, length)], title="mean history length, frames", frames=x),
+    ]
+    notes = [f"Interrupted: {len(done)} of {len(sequence.files)} frames are done."] if summary.interrupted else []
+    notes += [*run.source.warnings, *summary.notes, *repairs(sum((Counter(one) for one in counts if one), Counter()))]
+    if unknown := [number for number, one in zip(x, known, strict=True) if not one]:
+        notes.append(
+            f"There is no record of frames {format_range(unknown)}: their time, repairs and history are unknown."
+        )
+    if bare := [frame.number for frame in shown if "history length" not in frame.maps.get("denoised", {})]:
+        notes.append(
+            f"The filter's maps of frames {format_range(bare)} are unknown: no report was asked for when they were denoised, "
+            "and they have no layers of --diagnostics."
+        )
+    rows = [
+        (number, one.get("status", UNKNOWN), *_score_cells(score), *_cells(times, count, mean))
+        for number, one, score, times, count, mean in zip(x, known, scores, seconds, repaired, length, strict=True)
+    ]
+    heads = ("frame", "status", "PSNR dB", "temporal error", "seconds", "repaired", "mean history")
+    before = f", {summary.resumed_at} of them by an earlier run" if summary.resumed_at else ""
+    told = [
+        ("frames", f"{len(done)} of {len(sequence.files)}{before}"),
+        ("device", summary.device or "nothing was left to compute"),
+        ("seconds, this run", f"{summary.seconds:.1f}"),
+        ("pictures", _pictures_of(shown, len(done))),
+    ]
+    return page.document(
+        f"{Path(sequence.name).name}: {run.method}, {run.preset}",
+        [
+            _title(sequence.name, f"denoised by {run.method}, {run.preset}"),
+            page.listed(notes),
+            page.viewer(shown, left="noisy", right="denoised", legends=legends(run.params._asdict())),
+            _plots(curves),
+            _folded("Every frame", page.table(heads, rows)),
+            f"<h2>Which channel plays which role</h2><pre>{page.escape(run.source.roles.describe())}</pre>",
+            _parameters(numbers(run.params, run.config)),
+            _versions(told),
+        ],
+    )
+
+
+class Pair(NamedTuple):
+    """A frame to compare: its number, its file, the reference's, and the one that it was made from, if known."""
+
+    number: int
+    path: str
+    reference: str
+    before: str | None = None
+
+
+def compare_page(
+    title: str,
+    pairs: Sequence[Pair],
+    scores: Sequence[metrics.Scores],
+    *,
+    table: tuple[Sequence[str], Iterable[Sequence[object]]],
+    notes: Sequence[str] = (),
+) -> str:
+    """The page about a comparison: the scores of all pairs, pictures of some. `table` holds the scores as text."""
+    chosen = page.evenly([pair.number for pair in pairs], MOST)
+    shown, attributes, found = [], {}, {}
+    for pair in pairs:
+        if pair.number in chosen:
+            image = exr.read(pair.path)
+            attributes = {name: value for name, value in image.attributes.items() if name.startswith("svgf_jax:")}
+            found = _recorded(attributes)
+            target = read_radiance(pair.reference)
+            maps = diagnostic_layers(image, longest=longest_history(found.get("parameters", {})))
+            pictures = {"result": read_radiance(pair.path)}
+            if pair.before is not None:
+                pictures = {"before": read_radiance(pair.before)} | pictures
+            shown.append(shown_frame(pair.number, pictures, target, {"result": maps}, len(chosen)))
+    x = [pair.number for pair in pairs]
+    curves = _curves(x, scores, {"result": _values(scores, "psnr")} | _noisy_line(shown, "before"))
+    curves += [
+        page.plot([Line(name, x, _values(scores, field))], title=name, frames=x)
+        for field, name in (("relmse", "relMSE"), ("ssim", "SSIM"), ("flip", "HDR-FLIP"))
+    ]
+    told = [
+        (name.removeprefix("svgf_jax:"), text) for name, text in attributes.items() if name != "svgf_jax:parameters"
+    ]
+    return page.document(
+        title,
+        [
+            _title(title, f"{len(pairs)} frames against their reference"),
+            page.listed(notes),
+            page.viewer(shown, left="result", right="reference", legends=legends(found.get("parameters"))),
+            _plots(curves),
+            _folded("Every frame", page.table(*table)),
+            _parameters(_recorded(attributes)) if attributes else "",
+            _versions([*told, ("pictures", _pictures_of(shown, len(pairs)))]),
+        ],
+    )
+
+
+def ablation_page(
+    title: str,
+    rows: tuple[Sequence[str], Iterable[Sequence[object]]],
+    frames_of: Mapping[str, Mapping[int, float]],
+    temporal_of: Mapping[str, Mapping[int, float]],
+    shown: Sequence[Shown],
+    *,
+    told: Sequence[tuple[str, object]],
+    roles: str,
+    values: Mapping[str, Any],
+    notes: Sequence[str] = (),
+) -> str:
+    """The page about an ablation: its table `rows`, curves of the two rows that are compared, pictures of each row."""
+    names = list(frames_of)
+    x = sorted({number for of in frames_of.values() for number in of})
+    curves = [
+        page.plot(
+            [Line(name, list(of), list(of.values())) for name, of in every.items()], title=text, frames=x, follow=True
+        )
+        for every, text in ((frames_of, "PSNR, dB"), (temporal_of, "temporal error"))
+    ]
+    return page.document(
+        title,
+        [
+            _title(title, "what each part of the filter is worth"),
+            page.listed(notes),
+            page.table(*rows),
+            page.viewer(shown, left=names[0], right=names[-1], legends=legends()),
+            _plots(curves),
+            f"<h2>Which channel plays which role</h2><pre>{page.escape(roles)}</pre>",
+            _parameters(values),
+            _versions(told),
+        ],
+    )
+
+
+def _run_frames(run: Run, done: Sequence[tuple[int, int, Path]]) -> tuple[list[Shown], list[metrics.Scores | None]]:
+    """What is shown of a run, and the scores of all frames that have a reference; each output is read once."""
+    chosen = page.evenly([number for _, number, _ in done], MOST)
+    shown: list[Shown] = []
+
+    def pairs() -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+        for index, number, path in done:
+            if number not in chosen and number not in run.references:
+                yield np.zeros(0), None
+                continue
+            image = exr.read(path)
+            result = beauty(image)
+            reference = run.references.get(number)
+            target = None if reference is None else read_reference(reference, size=result.shape[:2], number=number)
+            if number in chosen:
+                pictures = {"denoised": result}
+                if run.source.sequence.files[index][1] is not None:
+                    pictures = {"noisy": _noisy(frames.read_frame(run.source, index))} | pictures
+                maps = run.maps.get(number) or diagnostic_layers(image, longest=longest_history(run.params._asdict()))
+                look = {"exposure": run.options.exposure, "curve": run.options.tonemap}
+                shown.append(shown_frame(number, pictures, target, {"denoised": maps}, len(chosen), **look))
+            yield result, target
+
+    return shown, list(metrics.score_frames(pairs(), with_ssim=False))
+
+
+def _noisy(item: frames.LoadedFrame) -> np.ndarray:
+    """The beauty before the filter, what is not finite in it as 0."""
+    frame = item.frame
+    return np.nan_to_num(frame.radiance.sum(0) + frame.emission, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _recorded(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters and choices that an output's header says; {} where it does not."""
+    try:
+        found = json.loads(str(attributes.get("svgf_jax:parameters", "{}")))
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _curves(x: Sequence[int], scores: Sequence[metrics.Scores | None], psnr: Mapping[str, Any]) -> list[str]:
+    """PSNR and temporal error, where there are references."""
+    if not any(score is not None for score in scores):
+        return []
+    lines = [Line(name, *(of if isinstance(of, tuple) else (x, of))) for name, of in psnr.items()]
+    return [
+        page.plot(lines[::-1], title="PSNR, dB", frames=x),
+        page.plot([Line("", x, _values(scores, "temporal"))], title="temporal error", frames=x),
+    ]
+
+
+def _noisy_line(shown: Sequence[Shown], name: str = "noisy") -> dict[str, tuple[list[int], list[float]]]:
+    """The PSNR before the filter, of the frames that are shown."""
+    known = [(frame.number, float(frame.notes[name].split()[0])) for frame in shown if name in frame.notes]
+    return {name: ([number for number, _ in known], [value for _, value in known])} if known else {}
+
+
+def _values(scores: Sequence[metrics.Scores | None], field: str) -> list[float]:
+    return [math.nan if score is None else float(getattr(score, field)) for score in scores]
+
+
+def _score_cells(score: metrics.Scores | None) -> tuple[str, str]:
+    if score is None:
+        return "", ""
+    return f"{score.psnr:.2f}", "" if math.isnan(score.temporal) else f"{score.temporal:.5f}"
+
+
+def _cells(seconds: float, repaired: float, history: float) -> tuple[str, ...]:
+    forms = ((seconds, "{:.2f}"), (repaired, "{:.0f}"), (history, "{:.2f}"))
+    return tuple(UNKNOWN if math.isnan(value) else form.format(value) for value, form in forms)
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _title(title: str, below: str) -> str:
+    return f"<h1>{page.escape(title)}</h1><p>{page.escape(below)}</p>"
+
+
+def _plots(plots: Iterable[str]) -> str:
+    drawn = "".join(plots)
+    return f'<h2>Frame by frame</h2><div class="plots">{drawn}</div>' if drawn else ""
+
+
+def _folded(title: str, content: str) -> str:
+    return f"<details><summary>{page.escape(title)}</summary>{content}</details>"
+
+
+def _pictures_of(shown: Collection[Shown], count: int) -> str:
+    if len(shown) == count:
+        return f"of all {count} frames"
+    return f"of {len(shown)} of {count} frames, evenly spread: {format_range([frame.number for frame in shown])}"
+
+
+def _parameters(values: Mapping[str, Any]) -> str:
+    """Numbers and choices, as `outputs.numbers` gives them."""
+
+    def short(value: Any) -> str:
+        if isinstance(value, list):
+            return ", ".join(map(short, value))
+        return f"{value:.6g}" if isinstance(value, float) else str(value).lower()
+
+    both = {**values.get("parameters", {}), **values.get("config", {})}
+    rows = [(name, short(value)) for name, value in both.items()]
+    return f"<h2>Parameters</h2>{page.table(('parameter', 'value'), rows, words=True)}" if rows else ""
+
+
+def _versions(told: Sequence[tuple[str, object]]) -> str:
+    """Facts, and with which versions they came about: those of packages that are installed."""
+    versions = [("svgf_jax", __version__), ("Python", platform.python_version()), ("system", platform.platform())]
+    for name in ("jax", "numpy", "OpenEXR"):
+        try:
+            versions.append((name, importlib.metadata.version(name)))
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return f"<h2>Run and versions</h2>{page.table(('', ''), [*told, *versions], words=True)}"

@@ -1,0 +1,177 @@
+"""The page about a run: what it says, what it does in a browser, and that nothing out of a file becomes markup."""
+
+import html
+import json
+import re
+
+import browser
+import numpy as np
+import pytest
+from shots import init, step, write_shot
+
+from svgf_jax import checkpoint, exr, page, report, streaming
+from svgf_jax.commands import terminal
+from svgf_jax.frames import open_source
+from svgf_jax.outputs import WriteOptions
+from svgf_jax.references import pair_references
+from svgf_jax.types import Config, Params
+
+EVIL = "</script><script>console.log('evil')</script>"
+ACT = """
+(async () => {
+  const told = {};
+  const loaded = () => Promise.all([...document.images].filter((image) => image.src && !image.complete).map(
+    (image) => new Promise((done) => image.addEventListener("load", done))));
+  const bright = (image) => {  // reading a pixel back decodes the picture
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+    const context = canvas.getContext("2d");
+    context.drawImage(image, 0, 0);
+    return context.getImageData(0, 0, 1, 1).data[3];
+  };
+  const look = async () => {
+    await loaded();
+    const [under, over] = document.querySelectorAll(".stage img");
+    return {
+      number: number.textContent, left: document.querySelector(".is-left").textContent,
+      right: document.querySelector(".is-right").textContent, clip: over.style.clipPath, under: under.src, over: over.src,
+      widths: [...document.images].filter((image) => image.src).map((image) => image.naturalWidth),
+      decoded: [...document.images].filter((image) => image.src).map(bright),
+      maps: [...document.querySelectorAll("#maps figcaption")].map((text) => text.textContent),
+      now: document.querySelector("svg .now").getAttribute("x1"),
+    };
+  };
+  told.first = await look();
+  scrub.value = 0; scrub.dispatchEvent(new Event("input")); told.scrubbed = await look();
+  document.dispatchEvent(new KeyboardEvent("keydown", {key: ".", bubbles: true})); told.key = await look();
+  wipe.value = 20; wipe.dispatchEvent(new Event("input")); told.wiped = await look();
+  const box = stage.getBoundingClientRect();
+  const where = {clientX: box.left + 0.75 * box.width, clientY: box.top + 5, bubbles: true};
+  stage.dispatchEvent(new PointerEvent("pointerdown", where)); told.pressed = await look();
+  stage.dispatchEvent(new PointerEvent("pointermove", {...where, clientX: box.left + 0.1 * box.width}));
+  stage.dispatchEvent(new PointerEvent("pointerup", where)); told.dragged = await look();
+  right.value = "reference"; right.dispatchEvent(new Event("change")); told.chosen = await look();
+  told.wide = document.documentElement.scrollWidth <= window.innerWidth;
+  document.body.dataset.told = JSON.stringify(told);
+})();
+"""
+
+
+def in_browser(path, folder):
+    """What the viewer of a page shows while it is used."""
+    dom = browser.opened(path, folder, script=ACT)
+    return json.loads(html.unescape(re.search(r'data-told="(.*?)"', dom).group(1)))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A run of 30 frames that was broken off after ten, and the page about it: five shown, references of the first 28."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "MOST", 5)
+        yield make(tmp_path_factory)
+
+
+def make(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    shots, out = folder / "<b>in&", folder / "out"
+    write_shot(shots, range(1, 31))
+    write_shot(folder / "refs", range(1, 29))
+    for path in shots.glob("*.exr"):
+        image = exr.read(path)
+        exr.write(path, image._replace(channels={k.replace("albedo", EVIL): v for k, v in image.channels.items()}))
+    source = open_source(shots, channel={"albedo": [f"{EVIL}.{c}" for c in "RGB"]})
+    references, _ = pair_references(source.sequence, folder / "refs")
+    options = {"pipeline": (init, step), "params": Params(alpha=0.5)}
+    streaming.run(source, out, stop=iter([False] * 9 + [True] * 30).__next__, **options)
+    run = report.Run(
+        source, out, "svgf", "paper", Params(alpha=0.5), Config(), WriteOptions(exposure=2.0), references, {}
+    )
+    summary = streaming.run(source, out, resume=True, on_output=report.watch(run), **options)
+    text = report.run_page(run, summary, repairs=terminal.repairs)
+    page.write(folder / "page.html", text)
+    return run, summary, text, folder
+
+
+def test_the_page_says_what_was_done_and_what_is_not_known(made):
+    run, summary, text, _ = made
+    assert summary.resumed_at == 10
+    assert "30 of 30, 10 of them by an earlier run" in text
+    assert "of 5 of 30 frames, evenly spread: 1-15x7,23,30" in text
+    assert "maps of frames 1,8 are unknown" in text
+    assert run.maps.keys() == {15, 23, 30}
+    assert "There is no record" not in text  # the first part noted its figures
+    rows = re.findall(r"<tr><td>(\d+)</td><td>filtered</td><td>([\d.]*)</td>", text)
+    assert [int(number) for number, _ in rows] == list(range(1, 31))
+    assert [bool(psnr) for _, psnr in rows] == [True] * 28 + [False] * 2
+    for wanted in ("alpha</td><td>0.5", "mean history length", "pixels repaired", "temporal error", "svgf_jax</td>"):
+        assert wanted in text
+    assert "http" not in re.sub(r"data:[^\"]*", "", text)
+
+
+def test_nothing_from_a_file_is_markup(made):
+    _, _, text, _ = made
+    assert EVIL not in text
+    assert html.escape(EVIL) in text
+    assert "<b>in&" not in text
+    assert "&lt;b&gt;in&amp;" in text
+
+
+def test_the_viewer_works_in_a_browser(made):
+    _, _, _, folder = made
+    told = in_browser(folder / "page.html", folder)
+    assert told["first"]["number"] == "frame 15"
+    assert told["first"]["left"].startswith("noisy: ")
+    assert told["first"]["right"].startswith("denoised: ")
+    assert min(told["first"]["widths"]) == 19
+    assert set(told["first"]["decoded"]) == {255}
+    names = [caption.split()[0] for caption in told["first"]["maps"]]
+    assert names[0] == "difference"
+    assert {"variance", "history"} <= set(names)
+    assert told["scrubbed"]["number"] == "frame 1"
+    assert told["scrubbed"]["under"] != told["first"]["under"]
+    assert float(told["scrubbed"]["now"]) < float(told["first"]["now"])
+    assert told["key"]["number"] == "frame 8"
+    clips = [
+        float(re.search(r"inset\(0(?:px)? ([\d.]+)%", told[what]["clip"]).group(1))
+        for what in ("wiped", "pressed", "dragged")
+    ]
+    assert clips == pytest.approx([80, 25, 90], abs=1)
+    assert told["chosen"]["right"] == "reference"
+    assert told["chosen"]["under"] != told["dragged"]["under"]
+    assert told["wide"]
+
+
+def test_a_frame_without_a_record_is_unknown(made, tmp_path):
+    run, summary, _, _ = made
+    checkpoint.remove_figures(run.out)
+    text = report.run_page(run, summary, repairs=terminal.repairs)
+    assert "There is no record of frames 1-30" in text
+    assert "<td>?</td><td>?</td><td>?</td>" in text
+    assert "mean history length" not in text
+
+
+def test_a_long_sequence_of_large_noisy_frames_stays_small():
+    rng = np.random.default_rng(0)
+    most = 12_000_000 // (24 * 12)
+    noise = rng.integers(0, 256, (720, 1280, 3), np.uint8)
+    assert len(page.picture(noise, most=most)) <= most
+    assert page.picture(noise[:8, :8], most=most).startswith("data:image/png")
+    assert page.evenly(range(1, 1001), 24)[::23] == (1, 1000)
+    assert page.evenly([3, 5], 24) == (3, 5)
+
+
+def test_plots_leave_out_what_is_not_there():
+    line = page.Line("<a>", [1, 2, 3], [1.0, float("nan"), 0.0])
+    text = page.plot([line], title="t", frames=[1, 3])
+    assert "nan" not in text
+    assert "&lt;a&gt;" in text
+    assert text.count("<circle") == 2
+    assert page.plot([line], title="t", log=True).count("<circle") == 1
+    assert page.plot([line._replace(y=[float("nan")] * 3)], title="t") == ""
+
+
+def test_maps_mean_what_their_legends_say():
+    heat = page.heat(np.array([[0.0, 0.5, 1.0, 2.0, np.nan]])).astype(int).sum(-1)[0]
+    assert heat[0] < heat[1] < heat[2] == heat[3]
+    red, white, blue = page.signed(np.array([[1.0, 0.0, -1.0]]))[0].tolist()
+    assert (red, white, blue) == ([255, 0, 0], [255, 255, 255], [0, 0, 255])
