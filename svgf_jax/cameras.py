@@ -95,7 +95,20 @@ def pixel_centres(shape: tuple[int, ...], origin: tuple[int, int] = (0, 0)) -> n
 
 def position_from_depth(camera: Camera, depth: np.ndarray, *, origin: tuple[int, int] = (0, 0)) -> np.ndarray:
     """World position `[H, W, 3]` of what is seen at view-space z `depth` `[H, W]` through each pixel's centre."""
-    return _from_camera(camera, _seen_at(camera, depth, origin), 1.0)
+    return from_camera(camera, _seen_at(camera, depth, origin), 1.0)
+
+
+def from_camera(camera: Camera, vector: np.ndarray, w: float) -> np.ndarray:
+    """`[..., 3]` in camera space to world space; w = 1 for points, 0 for directions."""
+    to_world = np.linalg.inv(camera.world_to_camera)
+    return vector @ to_world[:3, :3].T + w * to_world[:3, 3]
+
+
+def eye_ray_lengths(camera: Camera, shape: tuple[int, ...], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+    """`[H, W]`: how far one goes along the ray through a pixel's centre for each unit of z."""
+    ones = np.ones(shape[:2])
+    along = _seen_at(camera, ones, origin) - _seen_at(camera, 0 * ones, origin)
+    return np.sqrt((along * along).sum(-1))
 
 
 def previous_position(
@@ -118,9 +131,13 @@ def reproject(
     number: int,
     previous: int,
     position: np.ndarray | None = None,
+    before: np.ndarray | None = None,
     origin: tuple[int, int] = (0, 0),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where the points of frame `number` were at frame `previous`.
+
+    With positions, motion is from where this frame's camera shows them, not from the pixels' centres: samples that were jittered
+    within their pixels do not shake the history.
 
     Args:
         cameras: of both frames.
@@ -128,30 +145,36 @@ def reproject(
         object_id: `[H, W]`, -1 = no surface: such pixels move as directions at infinity do.
         number, previous: frame numbers.
         position: `[H, W, 3]` world positions, if the renderer wrote them; else taken from depth and camera.
+        before: `[H, W, 3]` where these points were, if the renderer says so; else taken from the objects' motion.
         origin: the first pixel's place on the screen.
 
     Returns:
         prev_depth `[H, W]` and motion `[H, W, 2]`, float32. Points behind the previous camera get the previous pixel
         (-1e4, -1e4); prev_depth is 0 where there is no surface.
     """
-    camera, before = find_camera(cameras, number), find_camera(cameras, previous)
+    camera, earlier = find_camera(cameras, number), find_camera(cameras, previous)
     surface = object_id != -1
     with np.errstate(all="ignore"):
-        point = _before(cameras, depth, object_id, number, previous, position, origin)
-        point = point @ before.world_to_camera[:3, :3].T + before.world_to_camera[:3, 3]
+        if before is None:
+            before = _before(cameras, depth, object_id, number, previous, position, origin)
+        point = before @ earlier.world_to_camera[:3, :3].T + earlier.world_to_camera[:3, 3]
         prev_depth = np.where(surface, point[..., 2], 0.0).astype(np.float32)
         if not surface.all():
             away = _seen_at(camera, np.ones_like(depth), origin) - _seen_at(camera, np.zeros_like(depth), origin)
-            away = _from_camera(camera, away, 0.0) @ before.world_to_camera[:3, :3].T
+            away = from_camera(camera, away, 0.0) @ earlier.world_to_camera[:3, :3].T
             point = np.where(surface[..., None], point, away)
-        rows = before.camera_to_screen
+        rows = earlier.camera_to_screen
         width = _dot(point, rows[3]) + rows[3, 3] * surface
         ahead = width > 0
-        x, y = _pixel_centres(depth.shape, origin)
+        here = _pixel_centres(depth.shape, origin)
+        if position is not None:
+            seen = surface & np.isfinite(position).all(-1)
+            shown = np.moveaxis(_shown(camera, position), -1, 0)
+            here = tuple(np.where(seen, one, centre) for one, centre in zip(shown, here, strict=True))
         motion = np.empty((*depth.shape, 2), np.float32)
-        for axis, centre in enumerate((x, y)):
+        for axis, one in enumerate(here):
             screen = (_dot(point, rows[axis]) + rows[axis, 3] * surface) / np.where(ahead, width, 1.0)
-            motion[..., axis] = np.where(ahead, screen, BEHIND) - centre
+            motion[..., axis] = np.where(ahead, screen, BEHIND) - one
     return prev_depth, motion
 
 
@@ -177,10 +200,8 @@ def position_residual(camera: Camera, position: np.ndarray, *, origin: tuple[int
 
     About 0 where cameras, positions and pixel grid belong together; meaningless where there is no surface.
     """
-    there = position.astype(np.float64) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    screen = there @ camera.camera_to_screen[:, :3].T + camera.camera_to_screen[:, 3]
     with np.errstate(all="ignore"):
-        apart = screen[..., :2] / screen[..., 3:] - pixel_centres(position.shape[:2], origin)
+        apart = _shown(camera, position) - pixel_centres(position.shape[:2], origin)
         return np.hypot(apart[..., 0], apart[..., 1])
 
 
@@ -194,16 +215,21 @@ def mismatch(
 ) -> tuple[str, str] | None:
     """What is wrong if positions `[H, W, 3]`, depths `[H, W]` and camera are not of one scene, and how much; None if they are.
 
-    Judged by the pixels `where` `[H, W]`, of which 1 % may be odd.
+    Judged by the pixels `where` `[H, W]`, of which 1 % may be odd. Positions that are spread around their pixels' centres by
+    less than a pixel are jittered, and well.
     """
     if not where.any():
         return None
-    beside = position_residual(camera, position, origin=origin)[where]
-    if (share := (beside > APART).mean()) > 0.01:
+    with np.errstate(all="ignore"):
+        off = (_shown(camera, position) - pixel_centres(position.shape[:2], origin))[where]
+        beside = np.hypot(off[:, 0], off[:, 1])
+    share = (beside > APART).mean()
+    jittered = (beside < 1).mean() > 0.99 and np.abs(np.median(off, axis=0)).max() < APART
+    if share > 0.01 and not jittered:
         most = beside[np.isfinite(beside)].max(initial=0.0)
         return (
             f"positions are shown more than {APART} pixels beside the centres of their pixels: motion and previous depths will be "
-            "wrong. Wanted cameras of the same frames, pixels counted from the top left, and no jitter but that of the positions.",
+            "wrong. Wanted cameras of the same frames, and pixels counted from the top left.",
             f"{100 * share:.3g} % of the pixels with a surface, at most {most:.3g} pixels beside.",
         )
     forward = camera.world_to_camera[2]
@@ -215,6 +241,13 @@ def mismatch(
             f"{100 * share:.3g} % of the pixels with a surface are more than 1 % off.",
         )
     return None
+
+
+def _shown(camera: Camera, position: np.ndarray) -> np.ndarray:
+    """`[H, W, 2]`: where on the screen the camera shows world positions `[H, W, 3]`."""
+    there = position.astype(np.float64) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    screen = there @ camera.camera_to_screen[:, :3].T + camera.camera_to_screen[:, 3]
+    return screen[..., :2] / screen[..., 3:]
 
 
 def _pixel_centres(shape: tuple[int, ...], origin: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -258,12 +291,6 @@ def _seen_at(camera: Camera, depth: np.ndarray, origin: tuple[int, int]) -> np.n
     x = (right_x * to_y[1] - to_x[1] * right_y) / determinant
     y = (to_x[0] * right_y - right_x * to_y[0]) / determinant
     return np.stack([x, y, depth], -1)
-
-
-def _from_camera(camera: Camera, vector: np.ndarray, w: float) -> np.ndarray:
-    """Camera space to world; w = 1 for points, 0 for directions."""
-    to_world = np.linalg.inv(camera.world_to_camera)
-    return vector @ to_world[:3, :3].T + w * to_world[:3, 3]
 
 
 def _object_motion(cameras: Cameras, number: int, previous: int) -> dict[int, np.ndarray]:

@@ -13,26 +13,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from svgf_jax import exr
+from svgf_jax import exr, renderers
+from svgf_jax.camera_files import find_cameras
 from svgf_jax.cameras import (
     Cameras,
     find_camera,
-    load_cameras,
     mismatch,
     position_from_depth,
     previous_depth,
     reproject,
 )
 from svgf_jax.exr_layout import PathName, Window
-from svgf_jax.matrices import load_matrices
+from svgf_jax.motion import convert, parse_convention
+from svgf_jax.planes import guides, in_world, light
 from svgf_jax.roles import Roles, canonical_role, check_channels, resolve_roles
-from svgf_jax.sequences import Missing, Sequence, beside, companion, find_sequence
+from svgf_jax.sequences import Missing, Sequence, beside, companion, find_sequence, patterns
 from svgf_jax.types import Frame, SvgfError
 
 _BESIDE = ("emission", "albedo", "normal", "depth", "motion", "id", "position")
 _IN_FRAME = " In frame "  # what follows it in a note are that frame's numbers
-FAR = 1e8
-"""Depths from here on are the renderers' way of saying that nothing was hit."""
 
 
 class Source(NamedTuple):
@@ -48,6 +47,7 @@ class Source(NamedTuple):
         warnings: what the user should know before the work starts, as sentences.
         max_pixels: largest picture that will be read.
         position: whether frames get their `Frame.position`.
+        table: the renderer's table (`svgf_jax.renderers`).
     """
 
     sequence: Sequence
@@ -60,6 +60,7 @@ class Source(NamedTuple):
     warnings: tuple[str, ...]
     max_pixels: int
     position: bool = False
+    table: renderers.Table = renderers.NATIVE
 
 
 class LoadedFrame(NamedTuple):
@@ -70,7 +71,8 @@ class LoadedFrame(NamedTuple):
         number, path: frame number and main file.
         image: the main file as it was, to pass its other layers through.
         counts: pixels repaired, by reason: `normal` (not of unit length by more than 1 %), `guides` (a hit by id or
-            alpha, but no usable depth or normal), `excess` (emission above the beauty that should contain it).
+            alpha, but no usable depth or normal), `excess` (emission above the beauty that should contain it), `rest` (beauty
+            beyond all kinds of light that are there; it stays unfiltered).
         notes: what else is odd about it, as sentences.
     """
 
@@ -90,6 +92,9 @@ def open_source(
     channel: Mapping[str, Iterable[str]] | None = None,
     file: Mapping[str, PathName] | None = None,
     cameras: PathName | None = "auto",
+    renderer: str = "auto",
+    layer: str | None = None,
+    motion: str | None = None,
     position: bool = False,
     max_pixels: int = exr.MAX_PIXELS,
 ) -> Source:
@@ -103,29 +108,44 @@ def open_source(
         file: role -> pattern of files that hold this role.
         cameras: a cameras.json, or GAMES202's `matrix_#.mat`; "auto" takes those beside the frames if there are any,
             None none.
+        renderer: whose names and conventions: a name of `svgf_jax.renderers`, a table of one's own (`mine.toml`), or "auto":
+            by the names of channels, header attributes and files.
+        layer: the view layer, where a file has several.
+        motion: what the motion vectors mean, in place of what the renderer's table says: words of `svgf_jax.motion`.
         position: also give each frame its world positions, which the joint bilateral filter reads: the renderer's, or from
             depth and cameras.
         max_pixels: refuse larger pictures.
 
     Raises SvgfError: whatever is missing or unclear, naming the file.
     """
-    sequence = find_sequence(pattern, frames=frames, missing=missing)
+    table = None if renderer == "auto" else renderers.load_table(renderer)
+    meaning = {} if motion is None else {"motion": str(parse_convention(motion))}
+    sequence = _find_frames(pattern, table, frames=frames, missing=missing)
     at, path = next((i, path) for i, (_, path) in enumerate(sequence.files) if path is not None)
     header = exr.read_header(path)
+    there = patterns(os.path.dirname(path))
+    table = table or renderers.detect_renderer(header.channels, header.attributes, tuple(there))
+    channels = renderers.in_layer(table, tuple(header.channels), layer, where=path)
     files = {canonical_role(role): companion(sequence, where) for role, where in (file or {}).items()}
     own = {role: (str(other.files[at][1]), exr.read_header(str(other.files[at][1]))) for role, other in files.items()}
 
     def settle(found: Iterable[str] = ()) -> Roles:
         names = {role: (name, tuple(other.channels)) for role, (name, other) in own.items()}
-        return resolve_roles(tuple(header.channels), channel=channel, files=names, beside=tuple(found), where=path)
+        return resolve_roles(
+            channels, channel=channel, files=names, beside=tuple(found), table=table, meaning=meaning, where=path
+        )
 
     roles = settle()
-    if near := {role: where for role in _BESIDE if role not in roles.layers and (where := _beside(sequence, role))}:
+    near = {role: where for role in _BESIDE if role not in roles.layers and (where := _beside(sequence, role))}
+    for role, globs in table.files.items():
+        if role not in roles.layers and (where := renderers.find_file(role, globs, there, where=path)):
+            near[role] = where
+    if near:
         files |= {role: companion(sequence, where) for role, where in near.items()}
         own |= {role: (str(files[role].files[at][1]), exr.read_header(str(files[role].files[at][1]))) for role in near}
         roles = settle(near)
     files = {role: other for role, other in files.items() if role in roles.layers}
-    found = _find_cameras(cameras, sequence, header, path)
+    found = find_cameras(cameras, sequence, header, path, elsewhere=table.cameras)
     if position and not ("position" in roles.layers or (found and "depth" in roles.layers)):
         raise SvgfError(
             f"{path}: no positions, and no depth with cameras to take them from. Wanted position.X, .Y, .Z "
@@ -133,12 +153,23 @@ def open_source(
         )
     if found and roles.layers.keys() & {"depth", "position"} and "motion" not in roles.layers:
         roles = roles._replace(absent=roles.absent | {"motion": f"{found.path} says"})
+    if (
+        "depth" not in roles.layers
+        and "position" in roles.layers
+        and (found or "camera" in _meaning(roles, "position"))
+    ):
+        roles = roles._replace(absent=roles.absent | {"depth": "the positions say"})
+    if "world" in _meaning(roles, "motion") and not (found and roles.layers.keys() & {"depth", "position"}):
+        raise SvgfError(
+            f"{path}: motion in world space needs cameras, and positions or depth. Give a cameras.json (--cameras), or say what "
+            "the motion vectors mean if this is wrong (--motion)."
+        )
     half = set()
-    for role, layer in roles.layers.items():
-        types = own[role][1].channels if layer.own_file else header.channels
-        if np.dtype(np.float16) in {types[name] for name in layer.channels}:
+    for role, one in roles.layers.items():
+        types = own[role][1].channels if one.own_file else header.channels
+        if np.dtype(np.float16) in {types[name] for name in one.channels}:
             half.add(role)
-    told = tuple(_warnings(roles, half, found))
+    told = tuple(_warnings(roles, half, found, table))
     return Source(
         sequence,
         roles,
@@ -150,6 +181,7 @@ def open_source(
         told,
         max_pixels,
         position,
+        table,
     )
 
 
@@ -163,8 +195,10 @@ def read_frame(source: Source, index: int) -> LoadedFrame:
     counts: dict[str, int] = {}
     notes: list[str] = []
     with np.errstate(all="ignore"):  # whatever is not finite is dealt with by name below, or by the filter
-        radiance, emission = _light(source.roles.signals, planes, counts)
-        object_id, normal, depth = _guides(planes, radiance.shape[1:3], counts)
+        radiance, albedo, emission = light(source.roles, planes, counts)
+        camera = None if source.cameras is None else find_camera(source.cameras, number)
+        planes = in_world(source.roles, planes, camera, _origin(source))
+        object_id, normal, depth = guides(source.roles, planes, radiance.shape[1:3], counts)
         motion, prev_depth = _past(source, index, planes, depth, object_id, notes)
         position = _position(source, number, planes, depth, object_id, notes)
         if "id" in source.half and (largest := np.fmax.reduce(planes["id"], axis=None)) > 2048:
@@ -172,10 +206,14 @@ def read_frame(source: Source, index: int) -> LoadedFrame:
                 f"object ids up to {largest:.0f} in half float: above 2048 neighbouring ids become one. "
                 "Let the renderer write ids as 32-bit."
             )
-    albedo = planes["albedo"] if "albedo" in planes else np.ones_like(emission)
+    if counts.get("rest", 0) > 0.01 * object_id.size:
+        notes.append(
+            f"the light is more than its parts: what is in none of {', '.join(source.roles.signals)} stays unfiltered. Switch on "
+            f"the passes that are missing.{_IN_FRAME}{number}: {100 * counts['rest'] / object_id.size:.3g} % of the pixels."
+        )
     measured = [planes[f"{role}_variance"][..., 0] for role in source.roles.signals if f"{role}_variance" in planes]
     variance = np.stack(measured) if measured else None
-    arrays: list[Any] = [radiance, albedo[None], emission, normal, depth, prev_depth, motion, object_id, variance]
+    arrays: list[Any] = [radiance, albedo, emission, normal, depth, prev_depth, motion, object_id, variance]
     arrays.append(position if source.position else None)
     counts = {reason: count for reason, count in counts.items() if count}
     return LoadedFrame(Frame(*arrays), number, str(path), image, counts, tuple(notes))
@@ -218,49 +256,6 @@ def _beside(sequence: Sequence, role: str) -> str | None:
     return next((where for where in found if where), None)
 
 
-def _light(
-    signals: tuple[str, ...], planes: dict[str, np.ndarray], counts: dict[str, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance `[S, H, W, 3]` and emission `[H, W, 3]`; from a beauty, which contains it, the emission is taken off."""
-    radiance = np.stack([planes[role] for role in signals])
-    emission = planes["emission"] if "emission" in planes else np.zeros_like(radiance[0])
-    if signals == ("radiance",) and "emission" in planes:
-        known = np.where(np.isfinite(emission), emission, 0)
-        reflected = radiance - known
-        slack = 2.0**-9 * np.abs(known)  # half-float rounding of both
-        counts["excess"] = int((reflected < -slack).any(-1).sum())
-        radiance = np.maximum(reflected, 0)  # NaN stays NaN
-    return radiance, emission
-
-
-def _guides(
-    planes: dict[str, np.ndarray], shape: tuple[int, ...], counts: dict[str, int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """object_id, normal (unit) and depth; 0 where there is no surface, which is decided here."""
-    ids = np.zeros(shape, np.int32)
-    hit = np.ones(shape, bool)
-    if "id" in planes:
-        given = planes["id"][..., 0]
-        ids = np.where(np.isfinite(given), np.rint(given), -1).astype(np.int64).astype(np.int32)  # uint32 wraps round
-        hit = ids != -1
-    if "alpha" in planes:
-        hit &= ~(planes["alpha"][..., 0] == 0)
-    surface = hit.copy()
-    normal = planes.get("normal", np.broadcast_to(np.array([0, 0, 1], np.float32), (*shape, 3)))
-    length = np.sqrt((normal * normal).sum(-1, dtype=np.float32))
-    surface &= ~(length == 0)  # one that is not finite counts as a surface that the filter drops and counts
-    depth = planes["depth"][..., 0] if "depth" in planes else np.ones(shape, np.float32)
-    surface &= (depth > 0) & (depth < FAR)
-    if "id" in planes or "alpha" in planes:
-        unexplained = ~(depth >= FAR)
-        if "id" in planes:  # an id says that something was hit: at an infinite depth the filter cannot follow it
-            unexplained |= np.isposinf(depth)
-        counts["guides"] = int((hit & ~surface & unexplained).sum())
-    counts["normal"] = int((surface & (np.abs(length - 1) > 0.01)).sum())
-    normal = np.where(surface[..., None], normal / length[..., None], 0).astype(np.float32)
-    return np.where(surface, ids, -1).astype(np.int32), normal, np.where(surface, depth, 0).astype(np.float32)
-
-
 def _past(
     source: Source,
     index: int,
@@ -276,13 +271,28 @@ def _past(
     motion = planes.get("motion", np.zeros((*depth.shape, 2), np.float32))
     prev_depth = depth
     skipped = before is not None and before != number - 1
+    convention = parse_convention(source.roles.layers["motion"].meaning if "motion" in planes else "")
+    world = motion if convention.unit == "world" else None
+    if "motion" in planes and world is None:
+        later = None
+        if convention.from_frame_before:
+            later = np.zeros_like(motion) if before != number - 1 else _motion_of(source, index - 1)
+        motion = convert(motion, convention, size=_screen_size(source), motion_before=later)
     if before is not None and source.cameras and planes.keys() & {"depth", "position"}:
         where: Any = {"number": number, "previous": before, "position": planes.get("position")}
         where["origin"] = _origin(source)
-        if skipped or "motion" not in planes:
+        if world is not None and not skipped:
+            here = planes.get("position")
+            if here is None:
+                here = position_from_depth(find_camera(source.cameras, number), depth, origin=_origin(source))
+            way = -1 if convention.direction == "from-previous" else 1
+            where |= {"before": here + way * world, "position": here}
+        if skipped or "motion" not in planes or world is not None:
             prev_depth, motion = reproject(source.cameras, depth, object_id, **where)
         else:
             prev_depth = previous_depth(source.cameras, depth, object_id, **where)
+    elif world is not None:  # nothing before it
+        motion = np.zeros((*depth.shape, 2), np.float32)
     elif skipped and "motion" in planes:
         notes.append(
             f"frame {number} follows frame {before}, but its motion vectors lead to frame {number - 1}; "
@@ -290,6 +300,15 @@ def _past(
         )
     sky = (object_id == -1)[..., None]
     return np.where(sky & ~np.isfinite(motion), 0, motion).astype(np.float32), prev_depth
+
+
+def _motion_of(source: Source, index: int) -> np.ndarray:
+    """The motion vectors of another frame, as its file has them."""
+    layer = source.roles.layers["motion"]
+    path = str((source.files["motion"] if layer.own_file else source.sequence).files[index][1])
+    image = _read(path, source)
+    check_channels(layer, image.channels, where=path, role="motion")
+    return _stack(image, layer.channels)
 
 
 def _position(
@@ -340,6 +359,28 @@ def _origin(source: Source) -> tuple[int, int]:
     return left - screen_left, top - screen_top
 
 
+def _screen_size(source: Source) -> tuple[int, int]:
+    """Width and height of the whole picture."""
+    left, top, right, bottom = source.display_window
+    return right - left + 1, bottom - top + 1
+
+
+def _meaning(roles: Roles, role: str) -> list[str]:
+    """The words of what a role's numbers mean."""
+    return roles.layers[role].meaning.split() if role in roles.layers else []
+
+
+def _find_frames(pattern: PathName, table: renderers.Table | None, *, frames: str | None, missing: Missing) -> Sequence:
+    """The frames; in a folder of a renderer's files, those with the radiance."""
+    text = os.fspath(pattern)
+    if os.path.isdir(text):
+        there = patterns(text)
+        table = table or renderers.detect_renderer((), (), tuple(there))
+        main = renderers.find_file("radiance", table.main, there, where=text)
+        text = main or text
+    return find_sequence(text, frames=frames, missing=missing)
+
+
 def _read(path: str, source: Source) -> exr.Image:
     image = exr.read(path, max_pixels=source.max_pixels)
     check_windows(image, path, source)
@@ -352,35 +393,16 @@ def _stack(image: exr.Image, channels: tuple[str, ...]) -> np.ndarray:
     return planes.astype(np.float64 if planes.dtype == np.uint32 else np.float32)
 
 
-def _find_cameras(wanted: PathName | None, sequence: Sequence, header: exr.Header, first: str) -> Cameras | None:
-    if wanted is None:
-        return None
-    path = os.path.join(os.path.dirname(first), "cameras.json") if wanted == "auto" else os.fspath(wanted)
-    if wanted == "auto" and not os.path.isfile(path):
-        path = beside(sequence, "matrix", extension=".mat")
-        if path is None:
-            return None
-    try:
-        cameras = load_matrices(companion(sequence, path)) if path.endswith(".mat") else load_cameras(path)
-        for number, file in sequence.files:
-            if file is not None:
-                find_camera(cameras, number)
-    except SvgfError as error:
-        raise SvgfError(f"{error} To go on without it: --cameras none (cameras=None).") from error
-    left, top, right, bottom = header.display_window
-    size = (right - left + 1, bottom - top + 1)
-    if cameras.size not in (None, size):
-        raise SvgfError(
-            f"{path}: cameras for pictures of {cameras.size}, but {first} shows {size}. "
-            "Wanted the same size; to go on without it: --cameras none (cameras=None)."
-        )
-    return cameras
-
-
-def _warnings(roles: Roles, half: set[str], cameras: Cameras | None) -> Iterator[str]:
+def _warnings(roles: Roles, half: set[str], cameras: Cameras | None, table: renderers.Table) -> Iterator[str]:
     for role in ("albedo", "normal", "depth", "motion"):
-        if role in roles.absent and not (role == "motion" and cameras):
-            yield f"no {role}: taken as {roles.absent[role]}."
+        if role in roles.absent and not (role == "motion" and cameras) and not roles.absent[role].endswith("say"):
+            switch = f" In {table.title}: {table.settings[role]}." if role in table.settings else ""
+            yield f"no {role}: taken as {roles.absent[role]}.{switch}"
+    if "camera" in _meaning(roles, "normal") and "or" not in _meaning(roles, "normal") and not cameras:
+        switch = f" In {table.title}: {table.settings['normal']}." if "normal" in table.settings else ""
+        yield f"normals are in camera space, and no camera is known: where it turns, history will be lost.{switch}"
+    if _meaning(roles, "depth") == ["distance"] and not cameras:
+        yield "depth is the distance along the ray, and no camera is known to make z of it: slopes will be a little off."
     for role in ("depth", "position"):
         if role in half:
             yield f"{role} is in half float, in steps of 0.1 %: slopes become stairs. Let the renderer write 32-bit."

@@ -20,6 +20,9 @@ Native names, as they are looked for in each frame's file:
 A variance is that of the mean of a pixel's samples (the samples' own divided by their number), of its luminance. It is used
 where every signal has one.
 
+A renderer's own names are in its table (`svgf_jax.renderers`), with those kinds of light that it writes apart, each with its own
+albedo. Where that table says nothing of a role, the native name is looked for. `environment` is added to the emission.
+
 Any role can be given by hand: other channels (`channel`), another file (`file`), or both. What is in neither is looked for in
 files of the same name beside `beauty_####.exr` (or color_): `normal_####.exr`, `depth_####.exr`, `ID_####.exr`, ...
 """
@@ -29,6 +32,7 @@ import os
 from collections.abc import Collection, Iterable, Mapping
 from typing import NamedTuple
 
+from svgf_jax.renderers import NATIVE, Table, pick
 from svgf_jax.types import SvgfError
 
 WIDTH = {
@@ -36,6 +40,7 @@ WIDTH = {
     "indirect": 3,
     "radiance": 3,
     "emission": 3,
+    "environment": 3,
     "albedo": 3,
     "normal": 3,
     "depth": 1,
@@ -74,26 +79,50 @@ _ABSENT = {
 
 
 class Layer(NamedTuple):
-    """The channels of one role; `own_file` if they are in the role's own file (`file`), not in the frame's."""
+    """The channels of one role; `own_file` if they are in the role's own file (`file`), not in the frame's.
+
+    `meaning` says what its numbers mean where that is not what this library means (`svgf_jax.renderers`).
+    """
 
     channels: tuple[str, ...]
     own_file: bool
     reason: str
+    meaning: str = ""
+
+
+class Light(NamedTuple):
+    """What a signal has for an albedo: a role ("" = none), and whether its light is already divided by it."""
+
+    albedo: str
+    divided: bool
+
+
+REST = "rest"
+"""The signal that is what a beauty has beyond the kinds of light that are there."""
 
 
 class Roles(NamedTuple):
     """Layer by role for what is there, and for what is not the default that stands in and what that costs.
 
-    `signals` names the roles that are filtered, in the order of `Frame.radiance`.
+    `signals` names the roles that are filtered, in the order of `Frame.radiance`, and `light` says what each is. Where kinds of
+    light and the beauty that they make up are both there, the layer `radiance` is that beauty, and no signal.
     """
 
     layers: dict[str, Layer]
     absent: dict[str, str]
     signals: tuple[str, ...]
+    light: dict[str, Light]
+    renderer: str = NATIVE.name
 
     def describe(self, *, absent: bool = True) -> str:
         """The mapping in one line a role, for people; `absent`: with those that are not there."""
-        lines = [f"{role:9} {' '.join(layer.channels)} ({layer.reason})" for role, layer in self.layers.items()]
+        lines = []
+        for role, layer in self.layers.items():
+            if role.removesuffix("_albedo") in self.light and role.endswith("_albedo"):
+                continue  # stands in its light's line
+            by = self.layers.get(f"{role}_albedo") if role in self.light else None
+            names = short_names(layer.channels) + (f", albedo {short_names(by.channels)}" if by else "")
+            lines.append(f"{role:9} {names} ({layer.reason}{'; ' if layer.meaning else ''}{layer.meaning})")
         lines += [f"{role:9} not there, taken as {default}" for role, default in self.absent.items() if absent]
         return "\n".join(lines)
 
@@ -104,6 +133,8 @@ def resolve_roles(
     channel: Mapping[str, Iterable[str]] | None = None,
     files: Mapping[str, tuple[str, Collection[str]]] | None = None,
     beside: Collection[str] = (),
+    table: Table = NATIVE,
+    meaning: Mapping[str, str] | None = None,
     where: str = "the file",
 ) -> Roles:
     """Find the roles among the channel names of a frame's file.
@@ -113,6 +144,8 @@ def resolve_roles(
         channel: role -> channel names, given by hand; one name may stand for all three of a colour.
         files: role -> (file name, its channel names) for roles with a file of their own.
         beside: those of `files` that were found beside the frames rather than given by hand.
+        table: the renderer's own names.
+        meaning: role -> what its numbers mean, in place of what the table says.
         where: the frame's file, for messages.
 
     Raises SvgfError: no radiance, an unknown role, a channel that is not there (the closest names are listed), a role
@@ -120,34 +153,51 @@ def resolve_roles(
     """
     by_hand = {canonical_role(role): tuple(names) for role, names in (channel or {}).items()}
     own = {canonical_role(role): content for role, content in (files or {}).items()}
+    means = {**table.meaning, **(meaning or {})}
     layers = {}
     for role in WIDTH:
         if role in by_hand or role in own:
             file, names = own.get(role, (where, channels))
-            layer = _given(role, by_hand.get(role), names, file, own_file=role in own)
-            layers[role] = layer._replace(reason=f"in {os.path.basename(file)}") if role in beside else layer
-        elif layer := _native(role, channels, where):
-            layers[role] = layer
-    asked = by_hand.keys() | own.keys()
+            layer = _given(role, by_hand.get(role), names, file, own_file=role in own, means=means.get(role, ""))
+            layer = layer._replace(reason=f"in {os.path.basename(file)}") if role in beside else layer
+        else:
+            layer = _known(role, channels, where, table, means.get(role, ""))
+        if layer:
+            layers[role] = layer._replace(meaning=layer.meaning or means.get(role, ""))
+    asked = (by_hand.keys() | own.keys()) - set(beside)
     if "radiance" in asked and asked & {"direct", "indirect"}:
         raise SvgfError("radiance is the whole beauty; give by hand either it, or direct and indirect.")
     parts = layers.keys() & {"direct", "indirect"}
     for role in parts if "radiance" in asked else {"radiance"} if parts else ():
         layers.pop(role, None)
-    signals = tuple(role for role in _SIGNALS if role in layers)
+    light = {role: Light("albedo", False) for role in _SIGNALS if role in layers}
+    if not asked & {"radiance", "direct", "indirect"} and (kinds := _light_apart(layers, channels, table, where)):
+        light = kinds
+    signals = tuple(light)
     if not signals:
         raise SvgfError(
             f"{where}: no radiance; wanted direct.R, direct.G, direct.B and indirect.R ..., or R, G, B. "
             f"{_nearest(['direct.R', 'indirect.R', 'R', 'radiance.R', 'beauty.R', 'Combined.R'], channels)} "
             "Say which it is: --channel radiance=NAME,NAME,NAME."
         )
-    if "radiance" not in layers and "alpha" not in by_hand:
+    if "radiance" not in layers and "alpha" not in by_hand and table is NATIVE:
         layers.pop("alpha", None)
     measured = [f"{role}_variance" for role in signals]
     for role in [role for role in layers if role.endswith("_variance")]:
         if role not in measured or not layers.keys() >= set(measured):
             layers.pop(role)
-    return Roles(layers, {role: text for role, text in _ABSENT.items() if role not in layers}, signals)
+    absent = {role: text for role, text in _ABSENT.items() if role not in layers}
+    if any(f"{role}_albedo" in layers for role in signals):
+        absent.pop("albedo", None)
+    return Roles(layers, absent, signals, light, table.name)
+
+
+def short_names(names: tuple[str, ...]) -> str:
+    """`Normal.XYZ` for Normal.X, Normal.Y and Normal.Z."""
+    stems = {name.rpartition(".")[0] for name in names}
+    if len(names) == 1 or len(stems) > 1 or "" in stems:
+        return " ".join(names)
+    return f"{stems.pop()}.{''.join(name.rpartition('.')[2] for name in names)}"
 
 
 def check_channels(layer: Layer, channels: Collection[str], *, where: str, role: str) -> None:
@@ -166,9 +216,32 @@ def canonical_role(name: str) -> str:
     return role
 
 
-def _given(role: str, names: tuple[str, ...] | None, there: Collection[str], file: str, *, own_file: bool) -> Layer:
+def _light_apart(layers: dict[str, Layer], channels: Collection[str], table: Table, where: str) -> dict[str, Light]:
+    """The kinds of light that a renderer wrote apart, put into `layers` with their albedos."""
+    light: dict[str, Light] = {}
+    for signal in table.light:
+        names = pick(signal.name, signal.channels, 3, channels, table=table, where=where)
+        albedo = pick(f"{signal.name}_albedo", signal.albedo, 3, channels, table=table, where=where)
+        if names is None or (signal.divided and albedo is None):
+            continue
+        layers[signal.name] = Layer(
+            names, False, f"{table.name} name", "divided by its albedo" if signal.divided else ""
+        )
+        if albedo is not None:
+            layers[f"{signal.name}_albedo"] = Layer(albedo, False, f"{table.name} name")
+        light[signal.name] = Light(f"{signal.name}_albedo" if albedo else "", signal.divided)
+    if light:
+        layers.pop("albedo", None)
+        if "radiance" in layers and not set(table.complete) <= layers.keys():
+            light[REST] = Light("", False)
+    return light
+
+
+def _given(
+    role: str, names: tuple[str, ...] | None, there: Collection[str], file: str, *, own_file: bool, means: str
+) -> Layer:
     """A role that was given by hand: its names, or what a file of its own calls them."""
-    width = WIDTH[role]
+    width = _width(role, means)
     if names is None:
         sets = [text.split() for text in (*_spellings(role), *_IN_OWN_FILE[width])]
         names = next((tuple(names) for names in sets if all(name in there for name in names)), None)
@@ -188,6 +261,22 @@ def _given(role: str, names: tuple[str, ...] | None, there: Collection[str], fil
     if gone := [name for name in names if name not in there]:
         raise SvgfError(f"{file}: no channel {gone[0]!r} for {role}. {_nearest(gone, there)}")
     return Layer(names, own_file, "given by hand")
+
+
+def _known(role: str, channels: Collection[str], where: str, table: Table, means: str) -> Layer | None:
+    """A role by the renderer's names for it; by its native name where its table says nothing of it."""
+    if role not in table.channels:
+        return _native(role, channels, where)
+    for key, meaning in ((role, ""), (f"camera_{role}", "camera")):
+        names = pick(role, table.channels.get(key, ()), _width(role, means), channels, table=table, where=where)
+        if names is not None:
+            return Layer(names, False, f"{table.name} name", meaning)
+    return None
+
+
+def _width(role: str, means: str) -> int:
+    """Motion in world space has three channels."""
+    return 3 if role == "motion" and "world" in means.split() else WIDTH[role]
 
 
 def _native(role: str, channels: Collection[str], where: str) -> Layer | None:

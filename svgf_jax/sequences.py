@@ -192,6 +192,11 @@ def _patterns(folder: str) -> list[str]:
     return sorted(f"{item.basename()}{item.padding()}{item.extension()}" for item in found)
 
 
+def patterns(folder: str) -> dict[str, str]:
+    """The EXR sequences and files of a folder: pattern by its name, in which one # stands for the whole frame number."""
+    return {re.sub("#+", "#", name): os.path.join(folder, name) for name in _patterns(folder)}
+
+
 def _near(pattern: str) -> str:
     """What is there instead, for an error message."""
     folder, name = os.path.split(pattern)

@@ -36,6 +36,9 @@ def command(
     channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = (),
     file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = (),
     cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto",
+    renderer: Annotated[str, Parameter(metavar="NAME", group=INPUT)] = "auto",
+    layer: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None,
+    motion: Annotated[str | None, Parameter(metavar="WORDS", group=INPUT)] = None,
     preset: Annotated[str | None, Parameter(metavar="NAME", group=WHAT)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=WHAT)] = None,
     set_: Annotated[
@@ -77,6 +80,9 @@ def command(
         channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
         file: The files of a role, for example normal=normal_####.exr. Repeatable.
         cameras: The cameras.json of a sequence; auto takes the one beside the frames, none ignores it.
+        renderer: Whose names and conventions: native, mitsuba, cycles, falcor, pbrt, ..., or a table of your own (mine.toml).
+        layer: The view layer, where a file has several.
+        motion: What motion vectors mean: pixel|fraction|ndc|world, y-down|y-up, to-previous|from-previous|to-next|from-next.
         preset: The preset to start from; paper if neither it nor --params is given.
         params: The parameter file to start from.
         set_: One parameter of the start: sigma_normal=64. Repeatable.
@@ -118,12 +124,9 @@ def command(
         raise SvgfError(f"{checkpoint}: no checkpoint to resume from; start without --resume.")
     if maps is not None and maps.exists() and not maps.is_dir():
         raise SvgfError(f"--maps {maps} is a file; wanted a folder.")
-    roles = settings.assignments(channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
-    reading: dict[str, Any] = {
-        "channel": {role: names.split(",") for role, names in roles.items()},
-        "file": settings.assignments(file, option="--file", example="normal=normal_####.exr"),
-        "cameras": None if cameras == "none" else cameras,
-    }
+    reading = settings.source_options(
+        channel=channel, file=file, cameras=cameras, renderer=renderer, layer=layer, motion=motion
+    )
     if flip:
         from svgf_jax.metrics import require_flip
 
@@ -167,7 +170,7 @@ def command(
         "seed": seed,
         "starts": starts,
         "choices": [str(choice) for choice in config],
-        "reading": [channel, file, cameras],
+        "reading": [channel, file, cameras, renderer, layer, motion],
     }
     terminal.warn(note for shot in (*shots, *held) for note in shot.notes)
     length = sum(shot.length for shot in shots)

@@ -35,6 +35,9 @@ def ablate(
     channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = (),
     file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = (),
     cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto",
+    renderer: Annotated[str, Parameter(metavar="NAME", group=INPUT)] = "auto",
+    layer: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None,
+    motion: Annotated[str | None, Parameter(metavar="WORDS", group=INPUT)] = None,
     preset: Annotated[str | None, Parameter(metavar="NAME", group=BASE)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=BASE)] = None,
     set_: Annotated[tuple[str, ...], Repeated, Parameter(name="--set", metavar="NAME=VALUE", group=BASE)] = (),
@@ -58,6 +61,9 @@ def ablate(
         channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
         file: The files of a role, for example normal=normal_####.exr. Repeatable.
         cameras: The cameras.json of the sequence, or matrix_#.mat; auto takes the one beside the frames, none ignores it.
+        renderer: Whose names and conventions: native, mitsuba, cycles, falcor, pbrt, ..., or a table of your own (mine.toml).
+        layer: The view layer, where a file has several.
+        motion: What motion vectors mean: pixel|fraction|ndc|world, y-down|y-up, to-previous|from-previous|to-next|from-next.
         preset: The base: a preset by name; `svgf-jax params list` shows them.
         params: The base: parameters from a TOML file.
         set_: One parameter of the base, or one value per a-trous level. Repeatable.
@@ -70,8 +76,9 @@ def ablate(
         overwrite: Replace the files of --json, --csv and --markdown if they exist.
     """
     record, chosen, config = settings.choose(preset, params, set_)
-    roles = settings.assignments(channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
-    files = settings.assignments(file, option="--file", example="normal=normal_####.exr")
+    reading = settings.source_options(
+        channel=channel, file=file, cameras=cameras, renderer=renderer, layer=layer, motion=motion
+    )
     results.require_writable((json_file, csv_file, markdown_file), overwrite=overwrite)
 
     from svgf_jax import ablation
@@ -79,17 +86,11 @@ def ablate(
     from svgf_jax.outputs import numbers
     from svgf_jax.references import pair_references
 
-    source = open_source(
-        input_,
-        frames=frames,
-        channel={role: names.split(",") for role, names in roles.items()},
-        file=files,
-        cameras=None if cameras == "none" else cameras,
-    )
+    source = open_source(input_, frames=frames, **reading)
     references, lacking = pair_references(source.sequence, reference)
     if themselves := {path for _, path in source.sequence.files} & set(references.values()):
         raise SvgfError(f"Got {min(map(str, themselves))} as its own reference; wanted a converged render of it.")
-    there = ablation.grid(chosen, config, signals=len(source.roles.signals), albedo="albedo" in source.roles.layers)
+    there = ablation.grid(chosen, config, signals=len(source.roles.signals), albedo="albedo" not in source.roles.absent)
     rows = ablation.choose_rows([] if only is None else [name.strip() for name in only.split(",")], there)
     terminal.warn([*source.warnings, *lacking])
 

@@ -44,6 +44,9 @@ def denoise(
     channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = (),
     file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = (),
     cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto",
+    renderer: Annotated[str, Parameter(metavar="NAME", group=INPUT)] = "auto",
+    layer: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None,
+    motion: Annotated[str | None, Parameter(metavar="WORDS", group=INPUT)] = None,
     method: Annotated[Method, Parameter(group=FILTER)] = "svgf",
     preset: Annotated[str | None, Parameter(metavar="NAME", group=FILTER)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=FILTER)] = None,
@@ -78,6 +81,9 @@ def denoise(
         channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
         file: The files of a role, for example normal=normal_####.exr. Repeatable.
         cameras: The cameras.json of the sequence, or matrix_#.mat; auto takes the one beside the frames, none ignores it.
+        renderer: Whose names and conventions: native, mitsuba, cycles, falcor, pbrt, ..., or a table of your own (mine.toml).
+        layer: The view layer, where a file has several.
+        motion: What motion vectors mean: pixel|fraction|ndc|world, y-down|y-up, to-previous|from-previous|to-next|from-next.
         method: games202: joint bilateral, then project and accumulate; the others are parts, -atrous in a-trous passes.
         preset: A preset of svgf by name; `svgf-jax params list` shows them.
         params: Parameters from a TOML file; `svgf-jax params show` prints one.
@@ -104,8 +110,9 @@ def denoise(
     """
     changes = (*set_, "taa=true") if taa else set_
     chosen_preset, chosen, config = settings.choose_method(method, preset, params, changes)
-    roles = settings.assignments(channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
-    files = settings.assignments(file, option="--file", example="normal=normal_####.exr")
+    reading = settings.source_options(
+        channel=channel, file=file, cameras=cameras, renderer=renderer, layer=layer, motion=motion
+    )
     if reference is not None and report is None:
         raise SvgfError(f"Got --reference {reference} without --report; references are for the report.")
     results.require_writable((report,), overwrite=overwrite or resume)
@@ -121,9 +128,7 @@ def denoise(
         input_,
         frames=frames,
         missing=missing,
-        channel={role: names.split(",") for role, names in roles.items()},
-        file=files,
-        cameras=None if cameras == "none" else cameras,
+        **reading,
         position=getattr(config, "filter", "") == "joint-bilateral",
     )
     scan = scan_files(source, most=None if dry_run else HEADERS)

@@ -42,6 +42,27 @@ def choose_method(
     return " ".join([method, *(f"{key}={text}" for key, text in texts.items())]), *override_method(method, values)
 
 
+def source_options(
+    *,
+    channel: Iterable[str],
+    file: Iterable[str],
+    cameras: str,
+    renderer: str,
+    layer: str | None,
+    motion: str | None,
+) -> dict[str, Any]:
+    """What the options of the input mean to `open_source`."""
+    roles = assignments(channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
+    return {
+        "channel": {role: names.split(",") for role, names in roles.items()},
+        "file": assignments(file, option="--file", example="normal=normal_####.exr"),
+        "cameras": None if cameras == "none" else cameras,
+        "renderer": renderer,
+        "layer": layer,
+        "motion": motion,
+    }
+
+
 def assignments(texts: Iterable[str], *, option: str, example: str) -> dict[str, str]:
     """`NAME=VALUE` texts as a dictionary, each name once."""
     pairs: dict[str, str] = {}

@@ -1,0 +1,205 @@
+"""What renderers call their channels and files, and what they mean by the numbers: one table a renderer, `tables/NAME.toml`.
+
+A table is data. Its keys (all but `title` may be absent):
+
+- `[detect]`: `channels`, `attributes` (of the header) and `files` (in the frame's folder); the table whose lines match most is it.
+- `layered`: channels have a layer's name in front ("ViewLayer.Combined.R").
+- `main`: which of several sequences in a folder holds the radiance, the likeliest first.
+- `cameras`: where cameras are, if not in a cameras.json: `header` or `camera_matrices.h`.
+- `[channels]`: role -> spellings, the best first. "Normal.XYZ" is Normal.X, Normal.Y and Normal.Z; "*" stands for anything.
+- `[files]`: role -> names of the files beside the frames that hold it; # is the frame number.
+- `[meaning]`: role -> what its numbers mean (below), where it is not what this library means.
+- `[[light]]`: a signal of its own: `name`, `channels`, `albedo` (spellings too), `divided = true` if it is already divided by it.
+- `complete`: signals and roles that make up the beauty; where not all of them are there, the rest of it is a signal too.
+- `[settings]`: role -> what to switch on in the renderer to get it.
+
+Meanings: of `motion` a convention (`svgf_jax.motion`); of `depth` "distance" (along the ray, not z); of `normal` and `position`
+"camera" (x right, y up, z into the picture), "camera z-back", or "camera or world" (whichever the cameras confirm); of `id` the
+number that stands for no object.
+"""
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from fnmatch import fnmatchcase
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from svgf_jax.toml import read_toml
+from svgf_jax.types import SvgfError
+
+_NONE: Mapping[str, Any] = MappingProxyType({})
+FOLDER = Path(__file__).parent / "tables"
+
+
+class Signal(NamedTuple):
+    """A kind of light that is filtered by itself; `divided` if its albedo is already taken out of it."""
+
+    name: str
+    channels: tuple[str, ...]
+    albedo: tuple[str, ...]
+    divided: bool
+
+
+class Table(NamedTuple):
+    """A renderer's table; see the top of this module."""
+
+    name: str
+    title: str
+    detect: Mapping[str, tuple[str, ...]] = _NONE
+    layered: bool = False
+    main: tuple[str, ...] = ()
+    cameras: str = ""
+    channels: Mapping[str, tuple[str, ...]] = _NONE
+    files: Mapping[str, tuple[str, ...]] = _NONE
+    meaning: Mapping[str, str] = _NONE
+    light: tuple[Signal, ...] = ()
+    complete: tuple[str, ...] = ()
+    settings: Mapping[str, str] = _NONE
+
+
+NATIVE = Table("native", "the names of svgf_jax itself")
+
+
+def renderer_names() -> tuple[str, ...]:
+    """The renderers that have a table, `native` first."""
+    return (NATIVE.name, *sorted(path.stem for path in FOLDER.glob("*.toml")))
+
+
+def load_table(name: str) -> Table:
+    """The table of a renderer by name, or from a file of one's own (`NAME.toml` with its path). Raises SvgfError."""
+    if name == NATIVE.name:
+        return NATIVE
+    path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
+    if path.parent == FOLDER and path.stem not in renderer_names():
+        known = ", ".join(renderer_names())
+        raise SvgfError(
+            f"no renderer is called {name!r}; there are {known}, or give a table of your own: shot/mine.toml."
+        )
+    return _load(path)
+
+
+@cache
+def _load(path: Path) -> Table:
+    content = read_toml(path, "table of a renderer").content
+    fields: dict[str, Any] = {"name": path.stem, "title": content.pop("title", path.stem)}
+    try:
+        for key in ("detect", "channels", "files"):
+            fields[key] = {role: _texts(spellings) for role, spellings in content.pop(key, {}).items()}
+        for key in ("meaning", "settings"):
+            fields[key] = {role: str(text) for role, text in content.pop(key, {}).items()}
+        fields |= {"layered": bool(content.pop("layered", False)), "cameras": str(content.pop("cameras", ""))}
+        fields |= {key: _texts(content.pop(key, ())) for key in ("main", "complete")}
+        fields["light"] = tuple(
+            Signal(one["name"], _texts(one["channels"]), _texts(one.get("albedo", ())), bool(one.get("divided", False)))
+            for one in content.pop("light", ())
+        )
+    except (AttributeError, TypeError, KeyError) as error:
+        raise SvgfError(f"{path}: {error!r} where a table of a renderer was read; see the ones in {FOLDER}.") from error
+    if content:
+        raise SvgfError(f"{path}: {', '.join(content)} not known; wanted {', '.join(Table._fields[1:])}.")
+    return Table(**fields)
+
+
+def detect_renderer(channels: Collection[str], attributes: Iterable[str] = (), files: Collection[str] = ()) -> Table:
+    """The renderer that wrote a file with these channels and header attributes, among these sequences of files in a folder.
+
+    `NATIVE` if no table says anything, or if native names are there.
+    """
+    if any(name.startswith(("direct.", "indirect.", "normal.X", "depth.Z")) for name in channels):
+        return NATIVE
+    best, most = NATIVE, 0
+    for name in renderer_names()[1:]:
+        table = load_table(name)
+        there = {"channels": channels, "attributes": attributes, "files": files}
+        layer = "*." if table.layered else ""
+        found = 0
+        for kind, lines in table.detect.items():
+            for line in lines:
+                wide = layer + line if kind == "channels" else line
+                found += any(_like(one, line) or _like(one, wide) for one in there[kind])
+        if found > most:
+            best, most = table, found
+    return best
+
+
+def layers_of(table: Table, channels: Iterable[str]) -> tuple[str, ...]:
+    """The names in front of a layered table's channels; "" for channels without one."""
+    found: dict[str, None] = {}
+    spellings = [*table.channels.get("radiance", ()), *(text for signal in table.light for text in signal.channels)]
+    for spelling in spellings:
+        for names in spelled(spelling, 3, channels, layered=True):
+            found.setdefault(names[0][: len(names[0]) - len(spelling) + 2].rstrip("."))
+    return tuple(sorted(found))
+
+
+def in_layer(table: Table, channels: Collection[str], layer: str | None, *, where: str) -> tuple[str, ...]:
+    """The channels of the layer that is wanted, or of the only one. Raises SvgfError: several, none of that name."""
+    if not table.layered:
+        if layer is not None:
+            raise SvgfError(f"Got --layer {layer}, but channels of {table.title} have no layers. Leave it out.")
+        return tuple(channels)
+    there = layers_of(table, channels)
+    listed = ", ".join(repr(name) for name in there) or "none"
+    if layer is not None and layer not in there:
+        raise SvgfError(f"{where}: no layer {layer!r}; there are {listed}. Say which: --layer NAME.")
+    if layer is None and len(there) > 1:
+        raise SvgfError(f"{where}: {len(there)} view layers: {listed}. Say which: --layer {there[0]}.")
+    name = layer if layer is not None else there[0] if there else ""
+    return tuple(one for one in channels if one.startswith(f"{name}.") or not name)
+
+
+def spelled(spelling: str, width: int, channels: Iterable[str], *, layered: bool = False) -> Iterator[tuple[str, ...]]:
+    """Every set of channels that a spelling of a role with `width` channels stands for."""
+    letters = spelling[-width:] if width > 1 else ("",)
+    base = spelling[:-width] if width > 1 else spelling
+    there = dict.fromkeys(channels)
+    for first in there:
+        stem = first[: len(first) - len(letters[0])]
+        if first.endswith(letters[0]) and (_like(stem, base) or (layered and base and _like(stem, f"*.{base}"))):
+            names = tuple(stem + letter for letter in letters)
+            if all(name in there for name in names):
+                yield names
+
+
+def pick(
+    role: str, spellings: Iterable[str], width: int, channels: Collection[str], *, table: Table, where: str
+) -> tuple[str, ...] | None:
+    """The channels of the first spelling that is there. Raises SvgfError where it stands for several."""
+    for spelling in spellings:
+        found = list(spelled(spelling, width, channels, layered=table.layered))
+        if len(found) > 1:
+            listed = "; ".join(",".join(names) for names in found)
+            raise SvgfError(
+                f"{where}: several channels may be {role}: {listed}. Say which: --channel {role}={','.join(found[0])}."
+            )
+        if found:
+            return found[0]
+    return None
+
+
+def find_file(role: str, globs: Iterable[str], patterns: Mapping[str, str], *, where: str) -> str | None:
+    """The sequence (pattern by its name with one #) that a table's names of files stand for. Raises SvgfError: several."""
+    for glob in globs:
+        found = [name for name in patterns if _like(name, glob)]
+        if len(found) > 1:
+            listed = ", ".join(patterns[name] for name in found)
+            raise SvgfError(
+                f"{where}: several files may be {role}: {listed}. Say which: --file {role}={patterns[found[0]]}."
+            )
+        if found:
+            return patterns[found[0]]
+    return None
+
+
+def _like(name: str, pattern: str) -> bool:
+    return fnmatchcase(name.lower(), pattern.lower())
+
+
+def _texts(value: Any) -> tuple[str, ...]:
+    """One text or a list of them."""
+    if isinstance(value, str):
+        return (value,)
+    if not all(isinstance(text, str) for text in value):
+        raise TypeError(f"got {value!r}, wanted texts")
+    return tuple(value)
