@@ -33,7 +33,7 @@ def test_a_dry_run_tells_everything_and_writes_nothing(shot, tmp_path, capsys):
     assert code == 0, error
     assert sorted(tmp_path.rglob("*")) == before
     assert f"3 frames (1-3), {SIZE[1]} x {SIZE[0]}" in error
-    assert "albedo    albedo.R albedo.G albedo.B (native name)" in error
+    assert "albedo    albedo.RGB (native name)" in error
     assert "would filter 3 frames and write 6 files" in error
     assert re.search(r"about \d+ s on two cores .* of memory, at most .* of disk", error)
     assert "nothing was written" in error

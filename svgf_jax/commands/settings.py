@@ -53,9 +53,10 @@ def source_options(
 ) -> dict[str, Any]:
     """What the options of the input mean to `open_source`."""
     roles = assignments(channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
+    files = assignments(file, option="--file", example="normal=normal_####.exr")
     return {
         "channel": {role: names.split(",") for role, names in roles.items()},
-        "file": assignments(file, option="--file", example="normal=normal_####.exr"),
+        "file": files,
         "cameras": None if cameras == "none" else cameras,
         "renderer": renderer,
         "layer": layer,
