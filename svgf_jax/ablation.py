@@ -41,11 +41,13 @@ class Measured(NamedTuple):
         row: which.
         scores: of the whole sequence (`metrics.mean_scores`).
         seconds: median time of a frame, compilation excluded.
+        frames: the scores of each frame that has a reference, by number.
     """
 
     row: Row
     scores: Scores
     seconds: float
+    frames: Mapping[int, Scores] = {}
 
 
 def _without_history(frame: Frame) -> Frame:
@@ -171,6 +173,7 @@ def ablate(
     device: str | None = None,
     pipeline: Pipeline | None = None,
     on_frame: Callable[[Row, int], None] = lambda row, number: None,
+    on_image: Callable[[str, int, np.ndarray, np.ndarray | None], None] = lambda name, number, image, target: None,
 ) -> Iterator[Measured]:
     """Measure the base and then each row. The sequence is read anew for each, one frame in memory at a time.
 
@@ -183,12 +186,13 @@ def ablate(
         params, config: the base.
         device, pipeline: as for `streaming.run`.
         on_frame: called with the row and the number of each frame that is done.
+        on_image: called with the row's name, the frame's number, its filtered image `[H, W, 3]` and its reference or None.
 
     Raises:
         SvgfError: a row that is not possible (before any work), unreadable or mismatching input.
     """
     chosen = [(row, *settings_of(row, params, config)) for row in (BASE, *rows)]
-    return (_measure(source, references, *one, device, pipeline, on_frame) for one in chosen)
+    return (_measure(source, references, *one, device, pipeline, on_frame, on_image) for one in chosen)
 
 
 def _measure(
@@ -200,8 +204,10 @@ def _measure(
     device: str | None,
     pipeline: Pipeline | None,
     on_frame: Callable[[Row, int], None],
+    on_image: Callable[[str, int, np.ndarray, np.ndarray | None], None],
 ) -> Measured:
     times: list[float] = []
+    numbers: list[int] = []
 
     def filtered() -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
         filters = history = None
@@ -221,8 +227,11 @@ def _measure(
             history, output = filters.step(history, frame)
             image = np.asarray(to_host(output, path).image)
             times.append(time.perf_counter() - began)
+            numbers.append(number)
+            on_image(row.name, number, image, target)
             yield image, target
             on_frame(row, number)
 
-    scores = [score for score in score_frames(filtered()) if score is not None]
-    return Measured(row, mean_scores(scores), float(np.median(times)))
+    every = list(score_frames(filtered()))
+    scores = {number: score for number, score in zip(numbers, every, strict=True) if score is not None}
+    return Measured(row, mean_scores(scores.values()), float(np.median(times)), scores)

@@ -1,6 +1,7 @@
 """Two sequences on disk, measured frame by frame. NumPy only."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,20 +13,21 @@ from svgf_jax.threads import read_ahead
 from svgf_jax.types import SvgfError
 
 
-def compare_sequences(
-    out: PathName,
-    reference: PathName,
-    *,
-    frames: str | None = None,
-    with_flip: bool = False,
-    warn: Callable[[str], None] = lambda text: None,
-) -> Iterator[tuple[int, Scores]]:
-    """(frame number, scores) of each frame that both sequences have, in order.
+class Pair(NamedTuple):
+    """A frame to compare: its number, its file and its reference's."""
 
-    `warn` hears of frames that one of them lacks, or both, and of pixels that are not finite.
+    number: int
+    path: str
+    reference: str
 
-    Folders, patterns or files as `find_sequence` takes them; of a folder's sequences, `frame` is taken for `out` and
-    `ref` for `reference`. Raises SvgfError: not found, no frame in common, unreadable, of different sizes, no colour.
+
+def pair_sequences(
+    out: PathName, reference: PathName, *, frames: str | None = None, warn: Callable[[str], None] = lambda text: None
+) -> list[Pair]:
+    """The frames that both sequences have, in order. No pixel is read.
+
+    `warn` hears of frames that one of them lacks, or both. Folders, patterns or files as `find_sequence` takes them; of a
+    folder's sequences, `frame` is taken for `out` and `ref` for `reference`. Raises SvgfError: not found, no frame in common.
     """
     sequences = (
         find_sequence(out, frames=frames, missing="reset", prefer=("frame", "denoised", "beauty")),
@@ -43,23 +45,45 @@ def compare_sequences(
     wanted = {number for sequence in sequences for number, _ in sequence.files}
     if frames is not None and (nowhere := wanted - ours.keys() - theirs.keys()):
         warn(f"frames {format_range(nowhere)} are in neither of the sequences")
+    return [Pair(number, ours[number], theirs[number]) for number in common]
 
-    def read(number: int) -> tuple[np.ndarray, np.ndarray]:
-        image, wanted = read_radiance(ours[number]), read_radiance(theirs[number])
+
+def compare_sequences(
+    out: PathName,
+    reference: PathName,
+    *,
+    frames: str | None = None,
+    with_flip: bool = False,
+    warn: Callable[[str], None] = lambda text: None,
+) -> Iterator[tuple[int, Scores]]:
+    """(frame number, scores) of each pair of `pair_sequences`. Raises SvgfError as that does, and as `compare_pairs`."""
+    return compare_pairs(pair_sequences(out, reference, frames=frames, warn=warn), with_flip=with_flip, warn=warn)
+
+
+def compare_pairs(
+    pairs: Sequence[Pair], *, with_flip: bool = False, warn: Callable[[str], None] = lambda text: None
+) -> Iterator[tuple[int, Scores]]:
+    """(frame number, scores) of each pair. `warn` hears of pixels that are not finite.
+
+    Raises SvgfError: unreadable, of different sizes, no colour.
+    """
+
+    def read(pair: Pair) -> tuple[np.ndarray, np.ndarray]:
+        image, wanted = read_radiance(pair.path), read_radiance(pair.reference)
         if image.shape != wanted.shape:
             raise SvgfError(
-                f"{ours[number]} is {image.shape[1]} x {image.shape[0]} pixels, {theirs[number]} {wanted.shape[1]} x "
+                f"{pair.path} is {image.shape[1]} x {image.shape[0]} pixels, {pair.reference} {wanted.shape[1]} x "
                 f"{wanted.shape[0]}; wanted the same size in both."
             )
         return image, wanted
 
     def checked() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for number, pair in zip(common, read_ahead(read, common, threads=1), strict=True):
-            for image, where in zip(pair, ("", " in the reference"), strict=True):
+        for pair, images in zip(pairs, read_ahead(read, pairs, threads=1), strict=True):
+            for image, where in zip(images, ("", " in the reference"), strict=True):
                 if bad := int((~np.isfinite(image)).any(-1).sum()):
-                    warn(f"frame {number}: {bad} pixel{'s' * (bad != 1)} not finite{where}")
-            yield pair
+                    warn(f"frame {pair.number}: {bad} pixel{'s' * (bad != 1)} not finite{where}")
+            yield images
 
-    for number, scores in zip(common, score_frames(checked(), with_flip=with_flip), strict=True):
+    for pair, scores in zip(pairs, score_frames(checked(), with_flip=with_flip), strict=True):
         assert scores is not None  # every pair has its reference
-        yield number, scores
+        yield pair.number, scores

@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from svgf_jax import __version__, checkpoint, exr, frames, metrics, page
+from svgf_jax.ablation import Measured
+from svgf_jax.comparison import Pair
 from svgf_jax.outputs import WriteOptions, beauty, numbers
 from svgf_jax.page import Line, Shown
 from svgf_jax.plan import output_paths
@@ -25,6 +27,7 @@ from svgf_jax.shown import MOST, diagnostic_layers, diagnostics, encoded, legend
 from svgf_jax.streaming import Summary
 from svgf_jax.types import Output
 
+ROW_FRAMES = 4  # frames with pictures of each row of an ablation
 UNKNOWN = "?"
 
 
@@ -128,24 +131,19 @@ def run_page(run: Run, summary: Summary, *, repairs: Callable[[Mapping[str, int]
     )
 
 
-class Pair(NamedTuple):
-    """A frame to compare: its number, its file, the reference's, and the one that it was made from, if known."""
-
-    number: int
-    path: str
-    reference: str
-    before: str | None = None
-
-
 def compare_page(
     title: str,
     pairs: Sequence[Pair],
     scores: Sequence[metrics.Scores],
     *,
+    before: Mapping[int, str],
     table: tuple[Sequence[str], Iterable[Sequence[object]]],
     notes: Sequence[str] = (),
 ) -> str:
-    """The page about a comparison: the scores of all pairs, pictures of some. `table` holds the scores as text."""
+    """The page about a comparison: the scores of all pairs, pictures of some.
+
+    `before`: what they were made from, by frame number, as far as that is known. `table` holds the scores as text.
+    """
     chosen = page.evenly([pair.number for pair in pairs], MOST)
     shown, attributes, found = [], {}, {}
     for pair in pairs:
@@ -156,8 +154,8 @@ def compare_page(
             target = read_radiance(pair.reference)
             maps = diagnostic_layers(image, longest=longest_history(found.get("parameters", {})))
             pictures = {"result": read_radiance(pair.path)}
-            if pair.before is not None:
-                pictures = {"before": read_radiance(pair.before)} | pictures
+            if pair.number in before:
+                pictures = {"before": read_radiance(before[pair.number])} | pictures
             shown.append(shown_frame(pair.number, pictures, target, {"result": maps}, len(chosen)))
     x = [pair.number for pair in pairs]
     curves = _curves(x, scores, {"result": _values(scores, "psnr")} | _noisy_line(shown, "before"))
@@ -182,34 +180,70 @@ def compare_page(
     )
 
 
+def watch_rows(
+    numbers: Sequence[int], rows: int
+) -> tuple[Callable[[str, int, np.ndarray, np.ndarray | None], None], Callable[[], list[Shown]]]:
+    """What takes each row's images of a sequence's frames, and what tells the viewer's frames of those seen so far."""
+    chosen = page.evenly(numbers, ROW_FRAMES)
+    frames_of: dict[int, Shown] = {number: Shown(number, {}) for number in chosen}
+
+    def on_image(row: str, number: int, image: np.ndarray, target: np.ndarray | None) -> None:
+        if number in chosen:
+            one = shown_frame(number, {row: image}, target, {}, len(chosen), pictures_a_frame=2 * rows + 2)
+            before = frames_of[number]
+            frames_of[number] = Shown(
+                number,
+                {**one.pictures, **before.pictures},
+                {**one.maps, **before.maps},
+                {**one.notes, **before.notes},
+            )
+
+    return on_image, lambda: [one for one in frames_of.values() if one.pictures]
+
+
 def ablation_page(
     title: str,
-    rows: tuple[Sequence[str], Iterable[Sequence[object]]],
-    frames_of: Mapping[str, Mapping[int, float]],
-    temporal_of: Mapping[str, Mapping[int, float]],
+    found: Sequence[Measured],
     shown: Sequence[Shown],
     *,
-    told: Sequence[tuple[str, object]],
+    table: tuple[Sequence[str], Iterable[Sequence[object]]],
     roles: str,
     values: Mapping[str, Any],
     notes: Sequence[str] = (),
 ) -> str:
-    """The page about an ablation: its table `rows`, curves of the two rows that are compared, pictures of each row."""
-    names = list(frames_of)
-    x = sorted({number for of in frames_of.values() for number in of})
+    """The page about an ablation: its `table`, curves of the two rows that are compared, pictures of each row."""
+    names = {one.row.name for one in found} | {"reference"}
+    shown = [
+        frame._replace(
+            pictures={name: url for name, url in frame.pictures.items() if name in names},
+            maps={name: maps for name, maps in frame.maps.items() if name in names},
+        )
+        for frame in shown  # a row that was broken off is not among them
+    ]
+    frames_of = sorted({number for one in found for number in one.frames})
+
+    def lines(value: Callable[[metrics.Scores], float]) -> list[Line]:
+        return [Line(one.row.name, list(one.frames), [value(score) for score in one.frames.values()]) for one in found]
+
     curves = [
         page.plot(
-            [Line(name, list(of), list(of.values())) for name, of in every.items()], title=text, frames=x, follow=True
-        )
-        for every, text in ((frames_of, "PSNR, dB"), (temporal_of, "temporal error"))
+            lines(lambda score: score.psnr), title="PSNR, dB: orange left, blue right", frames=frames_of, follow=True
+        ),
+        page.plot(
+            lines(lambda score: score.temporal),
+            title="temporal error: orange left, blue right",
+            frames=frames_of,
+            follow=True,
+        ),
     ]
+    told = [("pictures", _pictures_of(shown, len(frames_of))), ("rows", str(len(found)))]
     return page.document(
         title,
         [
-            _title(title, "what each part of the filter is worth"),
+            _title(title, "What each part of the filter is worth: each row differs from the base in one thing."),
             page.listed(notes),
-            page.table(*rows),
-            page.viewer(shown, left=names[0], right=names[-1], legends=legends()),
+            page.table(*table),
+            page.viewer(shown, left=found[0].row.name, right=found[-1].row.name, legends=legends()),
             _plots(curves),
             f"<h2>Which channel plays which role</h2><pre>{page.escape(roles)}</pre>",
             _parameters(values),

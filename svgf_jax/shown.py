@@ -28,6 +28,7 @@ def shown_frame(
     maps: Mapping[str, Mapping[str, Any]],
     count: int,
     *,
+    pictures_a_frame: int = 12,
     exposure: float = 1.0,
     curve: str = preview.CURVE,
 ) -> Shown:
@@ -35,9 +36,10 @@ def shown_frame(
 
     FLIP, which takes long, is of those pictures only that are in `maps`.
     """
+    most = share(count, pictures_a_frame)
     every = pictures if target is None else {**pictures, "reference": target}
     urls = {
-        name: page.picture(preview.to_8bit(image, exposure=exposure, curve=curve), most=share(count))
+        name: page.picture(preview.to_8bit(image, exposure=exposure, curve=curve), most=most)
         for name, image in every.items()
     }
     known = {name: dict(maps.get(name, {})) for name in pictures}
@@ -46,7 +48,7 @@ def shown_frame(
         assert target is not None
         if image.shape == target.shape:
             notes[name] = f"{metrics.psnr(image, target):.2f} dB"
-            known[name] = encoded(_against(image, target, flip=name in maps), share(count)) | known[name]
+            known[name] = encoded(_against(image, target, flip=name in maps), most) | known[name]
     return Shown(number, urls, {name: found for name, found in known.items() if found}, notes)
 
 

@@ -10,6 +10,7 @@ import pytest
 from shots import init, step, write_shot
 
 from svgf_jax import checkpoint, exr, page, report, streaming
+from svgf_jax.cli import main
 from svgf_jax.commands import terminal
 from svgf_jax.frames import open_source
 from svgf_jax.outputs import WriteOptions
@@ -175,3 +176,52 @@ def test_maps_mean_what_their_legends_say():
     assert heat[0] < heat[1] < heat[2] == heat[3]
     red, white, blue = page.signed(np.array([[1.0, 0.0, -1.0]]))[0].tolist()
     assert (red, white, blue) == ([255, 0, 0], [255, 255, 255], [0, 0, 255])
+
+
+def test_a_comparison_has_a_page(made, tmp_path, capsys):
+    run, _, _, folder = made
+    target = tmp_path / "page.html"
+    with pytest.raises(SystemExit) as end:
+        main(
+            ["compare", str(run.out), str(folder / "refs"), "--before", str(folder / "<b>in&"), "--report", str(target)]
+        )
+    text = target.read_text()
+    assert end.value.code == 0
+    assert "frames 29-30 are in only one of the sequences" in text  # what was told stands in the page too
+    assert "frames 29-30 are in only one of the sequences" in capsys.readouterr().err
+    assert re.search(r"<tr><td>mean</td><td>[\d.]+</td>", text)
+    assert "preset</td>" in text
+    assert "alpha</td><td>0.5" in text
+    told = in_browser(target, tmp_path)
+    assert told["first"]["left"].startswith("result: ")
+    assert set(told["first"]["decoded"]) == {255}
+
+
+def test_an_ablation_has_a_page(made, tmp_path, monkeypatch, capsys):
+    run, _, _, folder = made
+    monkeypatch.setattr("svgf_jax.compiled._jitted", lambda *_: (init, stand_in))
+    target = tmp_path / "page.html"
+    call = [
+        "ablate",
+        str(folder / "refs" / "shot.####.exr"),
+        "--reference",
+        str(run.out / "shot.####.exr"),
+        "--frames",
+        "1-6",
+    ]
+    with pytest.raises(SystemExit) as end:
+        main([*call, "--only", "no-history,levels-2", "--report", str(target)])
+    text = target.read_text()
+    assert (end.value.code, capsys.readouterr().err.count("PSNR")) == (0, 3)
+    rows = re.findall(r"<tr><td>(base|no-history|levels-2)</td>", text)
+    assert rows == ["base", "no-history", "levels-2"]
+    assert "of 4 of 6 frames" in text
+    told = in_browser(target, tmp_path)
+    assert (told["first"]["left"].partition(":")[0], told["chosen"]["right"]) == ("base", "reference")
+    assert [caption.split()[0] for caption in told["first"]["maps"]] == ["difference"]
+    lines = re.findall(r'<g data-name="([\w-]+)"', text)
+    assert lines == ["base", "no-history", "levels-2"] * 2
+
+
+def stand_in(history, frame, params):
+    return step(history, frame, params=params, config=Config())

@@ -46,6 +46,7 @@ def ablate(
     json_file: Annotated[Path | None, Parameter(name="--json", metavar="FILE", group=OUTPUT)] = None,
     csv_file: Annotated[Path | None, Parameter(name="--csv", metavar="FILE", group=OUTPUT)] = None,
     markdown_file: Annotated[Path | None, Parameter(name="--markdown", metavar="FILE", group=OUTPUT)] = None,
+    report: Annotated[Path | None, Parameter(metavar="FILE.html", group=OUTPUT)] = None,
     overwrite: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
 ) -> int:
     """Measure what each part of the filter is worth: a row for each choice that differs from a base in one thing.
@@ -73,18 +74,20 @@ def ablate(
         json_file: Write all numbers to this file as JSON.
         csv_file: Write all numbers to this file as CSV.
         markdown_file: Write the table to this file as Markdown.
-        overwrite: Replace the files of --json, --csv and --markdown if they exist.
+        report: Write one page to look at: the table, pictures and differences of each row, curves.
+        overwrite: Replace the files of --json, --csv, --markdown and --report if they exist.
     """
     record, chosen, config = settings.choose(preset, params, set_)
     reading = settings.source_options(
         channel=channel, file=file, cameras=cameras, renderer=renderer, layer=layer, motion=motion
     )
-    results.require_writable((json_file, csv_file, markdown_file), overwrite=overwrite)
+    results.require_writable((json_file, csv_file, markdown_file, report), overwrite=overwrite)
 
     from svgf_jax import ablation
     from svgf_jax.frames import open_source
     from svgf_jax.outputs import numbers
     from svgf_jax.references import pair_references
+    from svgf_jax.report import ablation_page, watch_rows
 
     source = open_source(input_, frames=frames, **reading)
     references, lacking = pair_references(source.sequence, reference)
@@ -94,6 +97,8 @@ def ablate(
     rows = ablation.choose_rows([] if only is None else [name.strip() for name in only.split(",")], there)
     terminal.warn([*source.warnings, *lacking])
 
+    there_are = [number for number, path in source.sequence.files if path is not None]
+    on_image, shown = watch_rows(there_are if report is not None else [], len(rows) + 1)
     found: list[Measured] = []
     count = len(source.sequence.files)
     title = f"{source.sequence.name}, {count} frame{'s' * (count != 1)}; base: {record}"
@@ -109,6 +114,7 @@ def ablate(
                 config=config,
                 device=device,
                 on_frame=lambda row, number: advance(f"{row.name}, frame {number}"),
+                on_image=on_image,
             )
             for one in measured:
                 found.append(one)
@@ -124,6 +130,19 @@ def ablate(
         interrupted = True
     if found:
         _print(title, found)
+        if report is not None:
+            notes = [f"Interrupted: {len(found)} of {len(rows) + 1} rows are done."] if interrupted else []
+            text = ablation_page(
+                title,
+                found,
+                shown(),
+                table=_to_table(found),
+                roles=source.roles.describe(),
+                values=numbers(chosen, config),
+                notes=[*notes, *source.warnings, *lacking],
+            )
+            results.save(report, text)
+            terminal.tell(f"report: {report}")
     if interrupted:
         terminal.tell(f"interrupted: {len(found)} of {len(rows) + 1} rows are done")
     return 130 if interrupted else 0
@@ -162,7 +181,7 @@ def _shown(one: "Measured", base: "Measured") -> dict[str, tuple[str, str]]:
 
 def _line(one: "Measured", base: "Measured", which: str) -> str:
     """A row in less than 80 columns."""
-    psnr, _, temporal, _ = (f"{value}{change and f' ({change})'}" for value, change in _shown(one, base).values())
+    psnr, _, temporal, _ = _joined(one, base)
     return f"{which}: {one.row.name}: PSNR {psnr}, temporal {temporal or 'none'}"
 
 
@@ -189,12 +208,21 @@ def _print(title: str, found: Sequence["Measured"]) -> None:
         console.print("A terminal of 130 columns or more also shows what each row means.")
 
 
+def _to_table(found: Sequence["Measured"]) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
+    """(heads, rows) for a page: all values with their changes, and the rows' meanings."""
+    heads = ("row", *(name for name, _ in COLUMNS.values()), "meaning")
+    return heads, [(one.row.name, *_joined(one, found[0]), ("text", one.row.meaning)) for one in found]
+
+
+def _joined(one: "Measured", base: "Measured") -> list[str]:
+    return [f"{value}{change and f' ({change})'}" for value, change in _shown(one, base).values()]
+
+
 def _to_markdown(title: str, found: Sequence["Measured"]) -> str:
     lines = [title, "", f"| row | {' | '.join(name for name, _ in COLUMNS.values())} | meaning |"]
     lines.append("|---|" + "---:|" * len(COLUMNS) + "---|")
     for one in found:
-        cells = (f"{value}{change and f' ({change})'}" for value, change in _shown(one, found[0]).values())
-        lines.append(f"| {one.row.name} | {' | '.join(cells)} | {one.row.meaning} |")
+        lines.append(f"| {one.row.name} | {' | '.join(_joined(one, found[0]))} | {one.row.meaning} |")
     return "\n".join(lines) + "\n"
 
 

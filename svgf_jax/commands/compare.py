@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from svgf_jax.commands import results, terminal
+from svgf_jax.types import SvgfError
 
 if TYPE_CHECKING:
     from svgf_jax.metrics import Scores
@@ -32,6 +33,8 @@ def compare(
     flip: Annotated[bool, Flag] = False,
     json_file: Annotated[Path | None, Parameter(name="--json", metavar="FILE")] = None,
     csv_file: Annotated[Path | None, Parameter(name="--csv", metavar="FILE")] = None,
+    report: Annotated[Path | None, Parameter(metavar="FILE.html")] = None,
+    before: Annotated[str | None, Parameter(metavar="SEQUENCE")] = None,
     overwrite: Annotated[bool, Flag] = False,
 ) -> None:
     """Measure a sequence against its reference, frame by frame and as a whole.
@@ -47,16 +50,27 @@ def compare(
         flip: HDR-FLIP too (slow; needs the extra `flip`).
         json_file: Write the scores to this file as JSON.
         csv_file: Write the scores to this file as CSV.
-        overwrite: Replace the files of --json and --csv if they exist.
+        report: Write one page to look at: pictures, maps of the error, curves.
+        before: What OUT was made from, also shown in the report.
+        overwrite: Replace the files of --json, --csv and --report if they exist.
     """
     from svgf_jax import metrics
-    from svgf_jax.comparison import compare_sequences
+    from svgf_jax.comparison import compare_pairs, pair_sequences
 
-    results.require_writable((json_file, csv_file), overwrite=overwrite)
+    if before is not None and report is None:
+        raise SvgfError(f"Got --before {before} without --report; it is shown in the report.")
+    results.require_writable((json_file, csv_file, report), overwrite=overwrite)
     if flip:
         metrics.require_flip()
-    pairs = compare_sequences(out, reference, frames=frames, with_flip=flip, warn=lambda text: terminal.warn([text]))
-    scores = {str(number): score for number, score in pairs}
+    told: list[str] = []
+
+    def warn(text: str) -> None:
+        terminal.warn([text])
+        told.append(text)
+
+    pairs = pair_sequences(out, reference, frames=frames, warn=warn)
+    earlier = {} if before is None else {pair.number: pair.path for pair in pair_sequences(before, reference)}
+    scores = {str(number): score for number, score in compare_pairs(pairs, with_flip=flip, warn=warn)}
     mean = metrics.mean_scores(scores.values())
     print_scores("frame", scores | {"mean": mean})
     if json_file is not None:
@@ -66,6 +80,15 @@ def compare(
         )
     if csv_file is not None:
         results.save(csv_file, _to_csv(scores | {"mean": mean}))
+    if report is not None:
+        from svgf_jax.report import compare_page
+
+        cells = _cells(scores | {"mean": mean}, lambda name, value: COLUMNS[name][1].format(value))
+        heads = ("frame", *(title for title, _ in COLUMNS.values()))
+        table = (heads, [(label, *row.values()) for label, row in cells.items()])
+        page = compare_page(out, pairs, list(scores.values()), before=earlier, table=table, notes=told)
+        results.save(report, page)
+        terminal.tell(f"report: {report}")
 
 
 def print_scores(title: str, rows: Mapping[str, "Scores"]) -> None:
