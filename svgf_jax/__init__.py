@@ -53,7 +53,10 @@ if TYPE_CHECKING:
     from svgf_jax.pipeline import step as step
     from svgf_jax.references import load_reference as load_reference
     from svgf_jax.references import read_radiance as read_radiance
+    from svgf_jax.reflections import Reflections as Reflections
+    from svgf_jax.reflections import trace_reflections as trace_reflections
     from svgf_jax.reprojection import reproject as reproject
+    from svgf_jax.reprojection import reproject_reflections as reproject_reflections
     from svgf_jax.sanitation import sanitise as sanitise
     from svgf_jax.tonemapping import decode_srgb as decode_srgb
     from svgf_jax.tonemapping import encode_srgb as encode_srgb
@@ -92,7 +95,8 @@ _HOME = {
     "parameters": ["load_params", "preset", "save_params"],
     "pipeline": ["denoise", "init", "step"],
     "references": ["load_reference", "read_radiance"],
-    "reprojection": ["reproject"],
+    "reflections": ["Reflections", "trace_reflections"],
+    "reprojection": ["reproject", "reproject_reflections"],
     "sanitation": ["sanitise"],
     "tonemapping": ["decode_srgb", "encode_srgb", "tonemap", "untonemap"],
     "types": ["Config", "Frame", "History", "Output", "Params", "Rejected", "Reprojected", "SvgfError", "TaaHistory"],

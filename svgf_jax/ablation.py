@@ -51,7 +51,7 @@ class Measured(NamedTuple):
 
 
 def _without_history(frame: Frame) -> Frame:
-    return frame._replace(motion=np.full_like(frame.motion, 1e6))
+    return _on_the_surface(frame)._replace(motion=np.full_like(frame.motion, 1e6))
 
 
 def _without_albedo(frame: Frame) -> Frame:
@@ -63,7 +63,12 @@ def _summed(frame: Frame) -> Frame:
     variance = frame.variance
     if variance is not None:
         variance = np.where((variance < 0).any(0), -1, variance.sum(0)).astype(variance.dtype)[None]
-    return frame._replace(radiance=frame.radiance.sum(0, keepdims=True), variance=variance)
+    one = {"radiance": frame.radiance.sum(0, keepdims=True), "albedo": frame.albedo[:1], "variance": variance}
+    return _on_the_surface(frame)._replace(**one)
+
+
+def _on_the_surface(frame: Frame) -> Frame:
+    return frame._replace(reflected_motion=None, reflected_prev_depth=None, longest_history=None)
 
 
 BASE = Row("base", {}, "as chosen")

@@ -29,24 +29,30 @@ def accumulate(
 ) -> Accumulated:
     """Blend this frame into its history with a = max(alpha, 1/h), h = min(prev_h + 1, max_history); a = 1 without history.
 
+    Where the frame says how long a signal's history is worth keeping, that signal's h is at most that.
+
     Where the frame brings a measured variance v of its pixels' means, the second moment is M1^2 + (1 - a) V' + a v with V' the
     variance in the history, so that M2 - M1^2 is a mean of measured variances; it is right from the first frame on.
 
     Args:
         illumination: `[S, H, W, 3]`, this frame's demodulated radiance.
         previous: the reprojected history.
-        frame: sanitised; its object_id is read, and its variance and radiance where it has a variance.
+        frame: sanitised; its object_id and longest_history are read, and its variance and radiance where it has a variance.
         params: per-level leaves are read at entry 0.
         config: without `warm_up`, a = alpha wherever there is history.
     """
     scalars = at_level(params, 0)
     measured = None if frame.variance is None else tuple(zip(frame.variance, map(planes, frame.radiance), strict=True))
 
-    def blend(colors, previous_colors, previous_moments, previous_length, valid, surface, measured):
+    def blend(colors, previous_colors, previous_moments, previous_length, valid, surface, measured, longest):
         length = jnp.where(valid, jnp.minimum(previous_length + 1.0, scalars.max_history), 1.0)
         least = 1.0 / jnp.maximum(length, 1.0) if config.warm_up else jnp.zeros_like(length)
         weight = _blend_weight(scalars.alpha, least, valid)
         weight_moments = _blend_weight(scalars.alpha_moments, least, valid)
+        if longest is not None:  # a shorter history is one that leans more on this frame
+            previous_colors, previous_moments = _shortened(
+                previous_colors, previous_moments, colors, longest, (weight, weight_moments)
+            )
         lumas = [jnp.minimum(luminance_of_planes(*color), largest_luminance(length.dtype)) for color in colors]
         moments = [(luma, luma * luma) for luma in lumas]
         blended_moments = jax.tree.map(
@@ -75,6 +81,7 @@ def accumulate(
         previous.valid,
         frame.object_id != -1,
         measured,
+        None if frame.longest_history is None else tuple(frame.longest_history),
     )
     return Accumulated(illumination=stack_planes(colors), moments=stack_planes(moments), history_length=length)
 
@@ -113,6 +120,17 @@ def clamp_history(
     # Where there is no history the 0 stays: nothing reads it, and nothing should.
     held = jax.tree.map(lambda a: jnp.where(previous.valid, a, 0.0), clamped)
     return previous._replace(illumination=stack_planes(held))
+
+
+def _shortened(previous_colors, previous_moments, colors, longest, weights: tuple[Array, Array]):
+    """History drawn towards this frame so far that blending with the weight a gives what the weight max(a, 1 / longest) would."""
+    out_colors, out_moments = [], []
+    for old, pair, color, frames in zip(previous_colors, previous_moments, colors, longest, strict=True):
+        share, share_moments = (jnp.maximum(1.0 / frames - a, 0.0) / jnp.maximum(1.0 - a, 1e-6) for a in weights)
+        luma = jnp.minimum(luminance_of_planes(*color), largest_luminance(frames.dtype))
+        out_colors.append(tuple(_blend(o, c, share) for o, c in zip(old, color, strict=True)))
+        out_moments.append((_blend(pair[0], luma, share_moments), _blend(pair[1], luma * luma, share_moments)))
+    return tuple(out_colors), tuple(out_moments)
 
 
 def _measured_moment(

@@ -39,6 +39,14 @@ def check_frame(frame: Frame) -> None:
         raise SvgfError(
             f"variance has shape {tuple(frame.variance.shape)}; wanted {(signals, height, width)}, one plane a signal"
         )
+    reflected = {
+        "reflected_motion": (signals, height, width, 2),
+        "reflected_prev_depth": (signals, height, width),
+        "longest_history": (signals, height, width),
+    }
+    there = {name: tuple(array.shape) for name in reflected if (array := getattr(frame, name)) is not None}
+    if there and there != reflected:
+        raise SvgfError(f"of reflections there is {there}; wanted {reflected}, or none of them")
     for name, array in frame._asdict().items():
         wanted_dtype = jnp.int32 if name == "object_id" else dtype
         if array is not None and array.dtype != wanted_dtype:

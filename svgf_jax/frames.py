@@ -26,6 +26,7 @@ from svgf_jax.cameras import (
 from svgf_jax.exr_layout import PathName, Window
 from svgf_jax.motion import convert, parse_convention
 from svgf_jax.planes import guides, in_world, light
+from svgf_jax.reflections import signals_reflected
 from svgf_jax.roles import Roles, canonical_role, check_channels, resolve_roles
 from svgf_jax.sequences import Missing, Sequence, beside, companion, find_sequence, patterns
 from svgf_jax.types import Frame, SvgfError
@@ -215,6 +216,8 @@ def read_frame(source: Source, index: int) -> LoadedFrame:
     variance = np.stack(measured) if measured else None
     arrays: list[Any] = [radiance, albedo, emission, normal, depth, prev_depth, motion, object_id, variance]
     arrays.append(position if source.position else None)
+    pair = {"number": number, "previous": _before(source, index), "origin": _origin(source)}
+    arrays += signals_reflected(source.cameras, source.roles.signals, planes, depth, normal, object_id, **pair)
     counts = {reason: count for reason, count in counts.items() if count}
     return LoadedFrame(Frame(*arrays), number, str(path), image, counts, tuple(notes))
 
@@ -266,8 +269,7 @@ def _past(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Motion `[H, W, 2]` and prev_depth `[H, W]` with respect to the frame that is read before this one."""
     number = source.sequence.files[index][0]
-    earlier = (source.sequence.files[i] for i in range(index - 1, -1, -1))
-    before = next((other for other, path in earlier if path is not None), None)
+    before = _before(source, index)
     motion = planes.get("motion", np.zeros((*depth.shape, 2), np.float32))
     prev_depth = depth
     skipped = before is not None and before != number - 1
@@ -309,6 +311,12 @@ def _motion_of(source: Source, index: int) -> np.ndarray:
     image = _read(path, source)
     check_channels(layer, image.channels, where=path, role="motion")
     return _stack(image, layer.channels)
+
+
+def _before(source: Source, index: int) -> int | None:
+    """The number of the frame that is read before this one."""
+    earlier = (source.sequence.files[i] for i in range(index - 1, -1, -1))
+    return next((other for other, path in earlier if path is not None), None)
 
 
 def _position(

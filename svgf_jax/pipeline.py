@@ -14,7 +14,7 @@ from svgf_jax.check import check_frame, check_history, check_params, check_seque
 from svgf_jax.color import demodulate
 from svgf_jax.modulation import modulate
 from svgf_jax.outliers import remove_outliers
-from svgf_jax.reprojection import reproject
+from svgf_jax.reprojection import reproject, reproject_reflections
 from svgf_jax.sanitation import sanitise
 from svgf_jax.types import Config, Frame, History, Output, Params, at_level
 from svgf_jax.variance import estimate_variance
@@ -65,6 +65,7 @@ def step(
     illumination = demodulate(frame.radiance, frame.albedo, albedo_floor=floor)
     illumination = remove_outliers(illumination, frame, params=params, config=config)
     previous = reproject(history, frame, params=params, config=config)
+    previous = reproject_reflections(previous, history, frame, params=params, config=config)
     previous = follow_light(previous, illumination, frame, params=params, config=config)
     previous = clamp_history(previous, illumination, frame, params=params, config=config)
     accumulated = accumulate(illumination, previous, frame, params=params, config=config)

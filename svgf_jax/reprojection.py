@@ -121,6 +121,31 @@ def reproject(
     )
 
 
+def reproject_reflections(
+    previous: Reprojected, history: History, frame: Frame, *, params: Params, config: Config = Config()
+) -> Reprojected:
+    """Take from where their reflections were the illumination and moments of the signals that have any.
+
+    A signal's previous pixels are judged as in `reproject`, at the reflected motion. Where none is consistent, and in signals
+    without reflections, the history stays that of the surface.
+    """
+    if frame.reflected_motion is None:
+        return previous
+    assert frame.reflected_prev_depth is not None  # `check_frame` saw to it: all three or none
+    signals = []
+    for s in range(frame.radiance.shape[0]):
+        past = history._replace(illumination=history.illumination[s : s + 1], moments=history.moments[s : s + 1])
+        seen = frame._replace(motion=frame.reflected_motion[s], prev_depth=frame.reflected_prev_depth[s])
+        signals.append(reproject(past, seen, params=params, config=config))
+
+    def choose(name: str) -> Array:
+        reflected = jnp.concatenate([getattr(signal, name) for signal in signals])
+        known = jnp.stack([signal.valid for signal in signals]) & previous.valid[None]
+        return jnp.where(known[..., None], reflected, getattr(previous, name))
+
+    return previous._replace(illumination=choose("illumination"), moments=choose("moments"))
+
+
 def _position(motion: Array, first_row: Array, axis: int, extent: int) -> Array:
     """P along one axis, in pixels; far outside the image it is as good as just outside."""
     index = lax.broadcasted_iota(jnp.int32, motion.shape, 1 - axis)

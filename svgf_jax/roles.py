@@ -14,6 +14,8 @@ Native names, as they are looked for in each frame's file:
 | `motion`   | `motion.X motion.Y`          | from the cameras; without them 0: everything stands still |
 | `id`       | `id.I`                       | one object: only depth and normals tell surfaces apart    |
 | `position` | `position.X ...`             | from depth and camera where needed                        |
+| `hit_distance` | `hit_distance.Z`         | reflections move with their surface                       |
+| `roughness` | `roughness.Y`               | 0, where there is a hit distance: mirrors                 |
 | `alpha`    | `A`, if radiance is `R G B`  | every pixel may have a surface                            |
 | `direct_variance`, `indirect_variance`, `radiance_variance` | `direct.variance` ... | estimated by the filter    |
 
@@ -47,6 +49,8 @@ WIDTH = {
     "motion": 2,
     "id": 1,
     "position": 3,
+    "hit_distance": 1,
+    "roughness": 1,
     "alpha": 1,
     "direct_variance": 1,
     "indirect_variance": 1,
@@ -63,6 +67,8 @@ _NATIVE = {
     "depth": ("depth.Z", "Z"),
     "motion": ("motion.X motion.Y",),
     "id": ("id.I",),
+    "hit_distance": ("hit_distance.Z",),
+    "roughness": ("roughness.Y",),
     "alpha": ("A",),
     **{f"{signal}_variance": (f"{signal}.variance",) for signal in ("direct", "indirect", "radiance")},
 }

@@ -14,7 +14,8 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
 
     Radiance: non-finite or negative components become 0. Emission: non-finite ones become 0, negative ones stay. A non-finite
     normal, depth, albedo or position: no surface. A non-finite motion or prev_depth: no history. Guides read 0 where there is no
-    surface, the albedo 1. A measured variance that is not finite or negative becomes -1, unknown.
+    surface, the albedo 1. A measured variance that is not finite or negative becomes -1, unknown. A non-finite reflected
+    motion or depth: the reflection moves with the surface.
 
     Args:
         frame: one frame; shapes as in `Frame`.
@@ -46,6 +47,7 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
         object_id=jnp.where(surface, frame.object_id, -1),
         variance=None if frame.variance is None else _known_variance(frame.variance),
         position=None if frame.position is None else jnp.where(surface[..., None], frame.position, 0.0),
+        **_reflections(frame, surface),
     )
     rejected = Rejected(
         radiance=_count(~radiance_finite.all(axis=(0, 3))),
@@ -55,6 +57,23 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
         motion=_count(surface & ~traced),
     )
     return repaired, rejected
+
+
+def _reflections(frame: Frame, surface: Array) -> dict[str, Array]:
+    """What is not finite moves with the surface; a length that is not a number is that of this frame alone."""
+    if frame.reflected_motion is None:
+        return {}
+    assert frame.reflected_prev_depth is not None  # `check_frame` saw to it: all three or none
+    assert frame.longest_history is not None
+    traced = (
+        surface[None] & jnp.isfinite(frame.reflected_motion).all(axis=-1) & jnp.isfinite(frame.reflected_prev_depth)
+    )
+    longest = jnp.where(jnp.isfinite(frame.longest_history), frame.longest_history, 1.0)
+    return {
+        "reflected_motion": jnp.where(traced[..., None], frame.reflected_motion, _NOWHERE),
+        "reflected_prev_depth": jnp.where(traced, frame.reflected_prev_depth, 0.0),
+        "longest_history": jnp.maximum(longest, 1.0),
+    }
 
 
 def _known_variance(variance: Array) -> Array:

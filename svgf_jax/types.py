@@ -21,6 +21,11 @@ Conventions, stated here once:
 | `object_id`   | `[H, W]` int32         | any number per object; -1 = no surface (background)                               |
 | `position`    | `[H, W, 3]` or None    | world space; None = not known; only the joint bilateral filter reads it            |
 | `variance`    | `[S, H, W]` or None    | measured variance of the pixel's mean, of the radiance's luminance; < 0 = unknown |
+| `reflected_motion`     | `[S, H, W, 2]` or None | as `motion`, of what the surface reflects; not finite = moves with the surface |
+| `reflected_prev_depth` | `[S, H, W]` or None    | depth of the reflecting surface at that previous position                      |
+| `longest_history`      | `[S, H, W]` or None    | frames of history worth keeping, >= 1                                          |
+
+The last three, from `svgf_jax.trace_reflections`, come together or not at all.
 """
 
 import math
@@ -50,6 +55,9 @@ class Frame(NamedTuple):
     object_id: Array
     variance: Array | None = None
     position: Array | None = None
+    reflected_motion: Array | None = None
+    reflected_prev_depth: Array | None = None
+    longest_history: Array | None = None
 
 
 class TaaHistory(NamedTuple):

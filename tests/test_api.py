@@ -21,12 +21,14 @@ def test_the_public_names_are_these():
         *("init", "step", "denoise", "taa", "taa_init", "TaaHistory"),
         *("baseline_init", "baseline_step", "baseline_denoise"),
         *("method", "MethodConfig"),
+        *("Reflections", "trace_reflections"),
         *(
             "sanitise",
             "demodulate",
             "remodulate",
             "modulate",
             "reproject",
+            "reproject_reflections",
             "accumulate",
             "clamp_history",
             "estimate_variance",
@@ -72,7 +74,8 @@ def frame_of_zeros(signals=1, height=3, width=4):
     shapes = dict.fromkeys(svgf_jax.Frame._fields, (height, width))
     shapes |= {"radiance": (signals, height, width, 3), "albedo": (1, height, width, 3), "motion": (height, width, 2)}
     shapes |= {"emission": (height, width, 3), "normal": (height, width, 3), "variance": (signals, height, width)}
-    shapes |= {"position": (height, width, 3)}
+    shapes |= {"position": (height, width, 3), "reflected_motion": (signals, height, width, 2)}
+    shapes |= dict.fromkeys(("reflected_prev_depth", "longest_history"), (signals, height, width))
     types = {name: np.int32 if name == "object_id" else np.float32 for name in shapes}
     return svgf_jax.Frame(**{name: np.zeros(shape, types[name]) for name, shape in shapes.items()})
 

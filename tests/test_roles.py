@@ -30,7 +30,9 @@ def test_measured_variances_are_taken_where_every_signal_has_one():
 def test_the_native_schema():
     roles = resolve_roles(NATIVE)
     assert roles.signals == ("direct", "indirect")
-    assert set(roles.layers) == set(WIDTH) - {"radiance", "alpha", "environment"} - MEASURED
+    assert (
+        set(roles.layers) == set(WIDTH) - {"radiance", "alpha", "environment", "hit_distance", "roughness"} - MEASURED
+    )
     assert roles.layers["normal"].channels == ("normal.X", "normal.Y", "normal.Z")
     assert roles.absent == {}
     assert all(layer.reason == "native name" and not layer.own_file for layer in roles.layers.values())

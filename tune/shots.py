@@ -89,6 +89,7 @@ def window(shot: Shot, *, rows: slice = slice(None), columns: slice = slice(None
     def read(index: int) -> Example:
         frame, target = shot.read(indices[index])
         axes = {"depth": 0, "prev_depth": 0, "object_id": 0, "radiance": 1, "albedo": 1, "variance": 1}
+        axes |= dict.fromkeys(("reflected_motion", "reflected_prev_depth", "longest_history"), 1)
         cut: dict[str, Any] = {
             name: np.ascontiguousarray(leaf[(slice(None),) * (axes.get(name) == 1) + (rows, columns)])
             for name, leaf in frame._asdict().items()

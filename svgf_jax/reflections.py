@@ -1,0 +1,141 @@
+"""Where a reflection was one frame ago: virtual motion by hit distance. NumPy only.
+
+What a mirror shows doesn't move with the mirror's surface but with the *virtual point*: the reflected thing, seen straight on
+through the surface, at the hit distance behind it along the view ray. So for point x seen from eye e, v = x + f hit (x - e) /
+|x - e|, and the reflection's previous pixel is where the previous camera sees v. Exact for a flat, still mirror of still things.
+
+f says how far a rough surface's image lies behind it, 1 for a mirror, 0 for a matt surface, which looks the same from all sides:
+the factor of the dominant direction of the GGX lobe, f = (1 - r) (sqrt(1 - r) + r) with roughness r (Lagarde & de Rousiers,
+Moving Frostbite to Physically Based Rendering, 2014). In between the image is neither here nor there: its history, which lies
+about its place by d = (1 - f) |virtual - surface| pixels a frame, is kept until it has drifted by one pixel, 1 + 1 / d frames.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from svgf_jax.cameras import BEHIND, Camera, Cameras, find_camera, pixel_centres, position_from_depth, previous_position
+
+LONGEST = 1e6
+"""Frames of history where nothing shortens it."""
+
+
+class Reflections(NamedTuple):
+    """The fields of the same names of `Frame`, for one signal: `[H, W, 2]`, `[H, W]` and `[H, W]`, float32."""
+
+    reflected_motion: np.ndarray
+    reflected_prev_depth: np.ndarray
+    longest_history: np.ndarray
+
+
+def trace_reflections(
+    cameras: Cameras,
+    depth: np.ndarray,
+    normal: np.ndarray,
+    object_id: np.ndarray,
+    hit_distance: np.ndarray,
+    *,
+    roughness: np.ndarray | float = 0.0,
+    number: int,
+    previous: int,
+    position: np.ndarray | None = None,
+    origin: tuple[int, int] = (0, 0),
+) -> Reflections:
+    """The past of what surfaces reflect.
+
+    Args:
+        cameras: of both frames.
+        depth, normal, object_id: `[H, W]`, `[H, W, 3]`, `[H, W]`; view-space z, world space, -1 = no surface.
+        hit_distance: `[H, W]`, world units from the surface to what it reflects; 0 = moves with the surface; infinite = far away.
+        roughness: `[H, W]` or one number in [0, 1], perceptual (0 = mirror, 1 = matt).
+        number, previous: frame numbers.
+        position: `[H, W, 3]` world positions, if the renderer wrote them; else taken from depth and camera.
+        origin: the first pixel's place on the screen.
+
+    Returns:
+        The reflections' motion; the depth that the reflecting surface, taken as flat, has at that previous pixel; and the frames of
+        history worth keeping. NaN motion where there is no surface or the hit distance is not a number.
+    """
+    camera, before = find_camera(cameras, number), find_camera(cameras, previous)
+    surface = object_id != -1
+    with np.errstate(all="ignore"):
+        if position is None:
+            position = position_from_depth(camera, np.where(surface, depth, 1.0), origin=origin)
+        position = position.astype(np.float64)
+        away = position - _eye(camera)
+        away /= np.linalg.norm(away, axis=-1, keepdims=True)
+        r = np.clip(np.asarray(roughness, np.float64), 0.0, 1.0)
+        share = (1.0 - r) * (np.sqrt(1.0 - r) + r)
+        behind = np.minimum(
+            share * np.maximum(hit_distance, 0.0), 1e6 * np.abs(depth)
+        )  # so far behind, it moves as at infinity
+        was = previous_position(cameras, position, object_id, number=number, previous=previous)
+        centres = pixel_centres(depth.shape, origin)
+        motion = _screen(before, was + behind[..., None] * away) - centres
+        on_surface = _screen(before, was) - centres
+        drift = (1.0 - share) * np.hypot(*np.moveaxis(motion - on_surface, -1, 0))  # the motion itself has the factor f
+        longest = np.minimum(1.0 + 1.0 / np.maximum(drift, 1e-9), LONGEST)
+        there = _depth_along(before, was, was + behind[..., None] * away, normal.astype(np.float64))
+    motion = np.where((surface & ~np.isnan(hit_distance))[..., None], motion, np.nan)
+    return Reflections(motion.astype(np.float32), there.astype(np.float32), longest.astype(np.float32))
+
+
+def signals_reflected(
+    cameras: Cameras | None,
+    signals: Sequence[str],
+    planes: Mapping[str, np.ndarray],
+    depth: np.ndarray,
+    normal: np.ndarray,
+    object_id: np.ndarray,
+    *,
+    number: int,
+    previous: int | None,
+    origin: tuple[int, int],
+) -> tuple[np.ndarray, ...]:
+    """`Reflections` of all signals, `[S, ...]`, of which those called glossy or specular reflect; `planes` are a file's, by role.
+
+    () where no hit distances and cameras tell it. In the first frame of all, everything stays on its surface.
+    """
+    reflect = [name.startswith(("glossy", "specular")) for name in signals]
+    if not any(reflect) or "hit_distance" not in planes or cameras is None:
+        return ()
+    still = moved = Reflections(
+        np.full((*depth.shape, 2), np.nan, np.float32),
+        np.zeros(depth.shape, np.float32),
+        np.full(depth.shape, LONGEST, np.float32),
+    )
+    if previous is not None:
+        moved = trace_reflections(
+            cameras,
+            depth,
+            normal,
+            object_id,
+            planes["hit_distance"][..., 0],
+            roughness=planes["roughness"][..., 0] if "roughness" in planes else 0.0,
+            number=number,
+            previous=previous,
+            position=planes.get("position"),
+            origin=origin,
+        )
+    return tuple(np.stack(fields) for fields in zip(*(moved if r else still for r in reflect), strict=True))
+
+
+def _eye(camera: Camera) -> np.ndarray:
+    return np.linalg.inv(camera.world_to_camera)[:3, 3]
+
+
+def _screen(camera: Camera, point: np.ndarray) -> np.ndarray:
+    """`[H, W, 2]`: where a camera sees world points; `BEHIND` where it doesn't."""
+    whole = camera.camera_to_screen @ camera.world_to_camera
+    x, y, w = (point @ whole[k, :3] + whole[k, 3] for k in (0, 1, 3))
+    return np.stack([np.where(w > 0, a / np.where(w > 0, w, 1.0), BEHIND) for a in (x, y)], -1)
+
+
+def _depth_along(camera: Camera, position: np.ndarray, towards: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Depth at which the ray from the camera to `towards` meets the plane through `position`."""
+    eye, forward = _eye(camera), camera.world_to_camera[2]
+    ray = towards - eye
+    slant = (ray * normal).sum(-1)
+    reach = ((position - eye) * normal).sum(-1) / np.where(np.abs(slant) > 1e-12, slant, 1.0)
+    return np.where(np.abs(slant) > 1e-12, reach * (ray @ forward[:3]), position @ forward[:3] + forward[3])
