@@ -6,6 +6,8 @@ import numpy as np
 
 from svgf_jax import exr
 from svgf_jax.exr_layout import PathName
+from svgf_jax.planes import light
+from svgf_jax.renderers import detect_renderer, in_layer
 from svgf_jax.roles import resolve_roles
 from svgf_jax.sequences import Sequence, find_sequence, format_range
 from svgf_jax.types import SvgfError
@@ -15,19 +17,26 @@ NAMES = ("ref", "reference", "frame")
 
 
 def read_radiance(path: PathName, *, max_pixels: int = exr.MAX_PIXELS) -> np.ndarray:
-    """Total radiance `[H, W, 3]` float32: R, G, B where the file has them, else direct + indirect + emission.
+    """Total radiance `[H, W, 3]` float32: R, G, B where the file has them, else the renderer's beauty, else all light added up.
 
-    Raises SvgfError: unreadable, or neither is there.
+    Raises SvgfError: unreadable, or nothing of this is there.
     """
     image = exr.read(path, max_pixels=max_pixels)
-    beauty = {"radiance": "RGB"} if {"R", "G", "B"} <= image.channels.keys() else None
-    roles = resolve_roles(tuple(image.channels), channel=beauty, where=os.fspath(path))
-    terms = roles.signals if beauty else (*roles.signals, "emission")
-    total = np.zeros((*next(iter(image.channels.values())).shape, 3), np.float32)
-    for role in terms:
-        if role in roles.layers:
-            total += np.stack([image.channels[name].astype(np.float32) for name in roles.layers[role].channels], -1)
-    return total
+    where = os.fspath(path)
+    if {"R", "G", "B"} <= image.channels.keys():
+        roles = resolve_roles(tuple(image.channels), channel={"radiance": "RGB"}, where=where)
+    else:
+        table = detect_renderer(image.channels, image.attributes)
+        roles = resolve_roles(in_layer(table, tuple(image.channels), None, where=where), table=table, where=where)
+
+    def plane(role: str) -> np.ndarray:
+        return np.stack([image.channels[name].astype(np.float32) for name in roles.layers[role].channels], -1)
+
+    if "radiance" in roles.layers:
+        return plane("radiance")
+    wanted = (*roles.signals, *(one.albedo for one in roles.light.values()), "emission", "environment")
+    radiance, _, emission = light(roles, {role: plane(role) for role in wanted if role in roles.layers}, {})
+    return radiance.sum(0) + emission
 
 
 def pair_references(
