@@ -10,8 +10,6 @@ from svgf_jax.cameras import eye_ray_lengths, find_camera
 from svgf_jax.frames import open_source, read_frame
 from svgf_jax.motion import Convention
 from svgf_jax.references import read_radiance
-from svgf_jax.renderers import FOLDER, detect_renderer, load_table, renderer_names
-from svgf_jax.roles import WIDTH
 from svgf_jax.warping import Step, find_convention, warp_residual
 
 DATA = Path(__file__).parent / "data"
