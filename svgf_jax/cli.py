@@ -15,6 +15,7 @@ from svgf_jax.commands.ablate import ablate
 from svgf_jax.commands.compare import compare
 from svgf_jax.commands.demo import demo
 from svgf_jax.commands.denoise import denoise
+from svgf_jax.commands.inspect import inspect
 from svgf_jax.commands.params import diff, list_, show
 from svgf_jax.commands.project import OTHERS, use_project
 from svgf_jax.commands.video import video
@@ -28,6 +29,7 @@ app = App(
     help_format="plaintext",
 )
 app.command(denoise)
+app.command(inspect)
 app.command(compare)
 app.command(ablate)
 app.command(demo)

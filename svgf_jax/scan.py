@@ -19,10 +19,11 @@ class Scan(NamedTuple):
     Attributes:
         there, missing: frame numbers.
         checked: how many frames' headers were read.
-        damaged: a sentence for each file that `read_frame` would not accept.
+        damaged: a sentence by frame number for what `read_frame` would not accept.
         stored: bytes of the files of all frames that are there.
         pixels: bytes that their pixels take uncompressed.
         compression: of the first frame's file.
+        unused: channels of the first frame's file that play no role.
         types: by role, "half", "float" or "uint", of the first frame.
         attributes: of the first frame's file.
     """
@@ -30,10 +31,11 @@ class Scan(NamedTuple):
     there: tuple[int, ...]
     missing: tuple[int, ...]
     checked: int
-    damaged: tuple[str, ...]
+    damaged: dict[int, str]
     stored: int
     pixels: int
     compression: str
+    unused: tuple[str, ...]
     types: dict[str, str]
     attributes: dict[str, Any]
 
@@ -46,13 +48,13 @@ def scan_files(source: Source, *, most: int | None = None) -> Scan:
         if most is None or len(numbered) <= most
         else [numbered[i * len(numbered) // most] for i in range(most)]
     )
-    damaged: list[str] = []
+    damaged: dict[int, str] = {}
     first: dict[str, Header] = {}
-    for index, _ in some:
+    for index, number in some:
         try:
             headers = _check_file(source, index)
         except SvgfError as error:
-            damaged.append(str(error))
+            damaged[number] = str(error)
             continue
         first = first or headers
     main = next(iter(first), "")
@@ -60,10 +62,11 @@ def scan_files(source: Source, *, most: int | None = None) -> Scan:
         tuple(number for _, number in numbered),
         tuple(number for number, path in source.sequence.files if path is None),
         len(some),
-        tuple(damaged),
+        damaged,
         sum(map(_size, _paths(source))),
         len(numbered) * sum(_raw_bytes(header) for header in first.values()),
         first[main].compression if first else "",
+        tuple(name for name in first[main].channels if name not in _used(source)) if first else (),
         _types(source, first),
         first[main].attributes if first else {},
     )
@@ -73,7 +76,7 @@ def require_sound(scan: Scan) -> None:
     """Raise SvgfError that names the damaged files, if there are any."""
     if scan.damaged:
         more = len(scan.damaged) - 3
-        raise SvgfError("\n".join(scan.damaged[:3]) + (f"\nand {more} more like this." if more > 0 else ""))
+        raise SvgfError("\n".join([*scan.damaged.values()][:3]) + (f"\nand {more} more like this." if more > 0 else ""))
 
 
 def samples_per_pixel(attributes: Mapping[str, Any]) -> tuple[str, float] | None:
@@ -109,6 +112,10 @@ def _paths(source: Source) -> set[str]:
     """Every file of the frames, each once."""
     own = [source.files[role] for role, layer in source.roles.layers.items() if layer.own_file]
     return {str(path) for sequence in (source.sequence, *own) for _, path in sequence.files if path is not None}
+
+
+def _used(source: Source) -> set[str]:
+    return {name for layer in source.roles.layers.values() if not layer.own_file for name in layer.channels}
 
 
 def _size(path: str) -> int:

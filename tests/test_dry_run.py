@@ -84,8 +84,9 @@ def test_every_damaged_file_is_told_before_the_first_frame(shot, tmp_path, capsy
 def test_a_scan_tells_what_headers_say(shot, tmp_path):
     (shot / "shot.0002.exr").unlink()
     scan = scan_files(open_source(shot, missing="hold"))
-    assert (scan.there, scan.missing, scan.checked, scan.damaged) == ((1, 3), (2,), 2, ())
+    assert (scan.there, scan.missing, scan.checked, scan.damaged) == ((1, 3), (2,), 2, {})
     assert scan.compression == "zip"
+    assert scan.unused == ("crypto.R",)
     assert scan.types["direct"] == "half"
     assert scan.types["depth"] == "float"
     assert scan.stored == sum(path.stat().st_size for path in shot.glob("*.exr"))
@@ -99,7 +100,7 @@ def test_a_scan_finds_a_channel_that_is_gone(shot):
     path = shot / "shot.0002.exr"
     image = exr.read(path)
     exr.write(path, image._replace(channels={name: p for name, p in image.channels.items() if name != "depth.Z"}))
-    assert "no channel 'depth.Z'" in scan_files(open_source(shot)).damaged[0]
+    assert "no channel 'depth.Z'" in scan_files(open_source(shot)).damaged[2]
 
 
 @pytest.mark.parametrize(

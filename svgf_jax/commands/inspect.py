@@ -1,0 +1,263 @@
+"""`svgf-jax inspect`."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Group, Parameter
+
+from svgf_jax.commands import settings, terminal
+
+if TYPE_CHECKING:
+    from svgf_jax.findings import Finding
+    from svgf_jax.geometry import Fit
+    from svgf_jax.inspection import Facts
+
+Flag = Parameter(negative=(), show_default=False)
+Repeated = Parameter(negative=(), consume_multiple=False, show_default=False)
+INPUT, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["Input", "Output"]))
+CONVENTIONS = 4  # motion conventions that are shown besides those that fit
+LABEL = 12  # columns
+Rows = list[tuple[str, str]]
+
+
+def inspect(
+    input_: Annotated[str, Parameter(name="INPUT", group=INPUT)],
+    /,
+    *,
+    frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
+    missing: Annotated[Literal["error", "hold", "reset"], Parameter(group=INPUT)] = "error",
+    channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = (),
+    file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = (),
+    cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto",
+    renderer: Annotated[str, Parameter(metavar="NAME", group=INPUT)] = "auto",
+    layer: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None,
+    motion: Annotated[str | None, Parameter(metavar="WORDS", group=INPUT)] = None,
+    preset: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None,
+    json: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
+    strict: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
+) -> int:
+    """Say what a sequence is and what is wrong with it, before a long run: all headers, the pixels of three or four frames.
+
+    Exits with 0 if `svgf-jax denoise` would run, 2 if not.
+
+    Args:
+        input_: A folder, a pattern (frame_####.exr, frame_%04d.exr, frame_$F4.exr) or one file.
+        frames: Only these: 1-100, 1-100x2 or 1,3,5-9.
+        missing: As for denoise: hold and reset allow missing frames.
+        channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
+        file: The files of a role, for example normal=normal_####.exr. Repeatable.
+        cameras: The cameras.json of the sequence, or matrix_#.mat; auto takes the one beside the frames, none ignores it.
+        renderer: Whose names and conventions: native, mitsuba, cycles, falcor, pbrt, ..., or a table of your own (mine.toml).
+        layer: The view layer, where a file has several.
+        motion: What motion vectors mean: pixel|fraction|ndc|world, y-down|y-up, to-previous|from-previous|to-next|from-next.
+        preset: The preset of the run, for its history and time; `svgf-jax params list` shows them.
+        json: Print everything as JSON to the standard output instead.
+        strict: Exit with 2 if there is anything to mend, too.
+    """
+    _, params, config = settings.choose(preset, None, ())
+    reading = settings.source_options(
+        channel=channel, file=file, cameras=cameras, renderer=renderer, layer=layer, motion=motion
+    )
+
+    from svgf_jax.findings import judge, verdict
+    from svgf_jax.frames import open_source
+    from svgf_jax.inspection import inspect_source
+
+    source = open_source(input_, frames=frames, missing="reset" if missing == "error" else missing, **reading)
+    facts = inspect_source(source, params=params, config=config)
+    findings = judge(facts, gaps_allowed=missing != "error")
+    if json:
+        terminal.print_json(_record(facts) | {"findings": findings, "verdict": verdict(findings)})
+    else:
+        _print(facts, findings, verdict(findings))
+    bad = ("error", "warning") if strict else ("error",)
+    return 2 if any(one.level in bad for one in findings) else 0
+
+
+def _print(facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str) -> None:
+    """Sections of labels and texts, then what to mend, then the verdict. Nothing is taken for markup."""
+    from rich.console import Console
+    from rich.padding import Padding
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(highlight=False)
+    console.print(Text(facts.name, style="bold"))
+    for title, rows in _sections(facts):
+        grid = Table.grid(padding=(0, 2, 0, 0))
+        grid.add_column(width=LABEL, no_wrap=True)
+        grid.add_column(overflow="fold")
+        for label, text in rows:
+            grid.add_row(Text(label, style="cyan", overflow="ellipsis"), Text(text))
+        console.print()
+        console.print(Text(title, style="bold"))
+        console.print(Padding(grid, (0, 0, 0, 2)))
+    for title, level, style in (
+        ("Errors", "error", "bold red"),
+        ("To mend", "warning", "bold yellow"),
+        ("Notes", "note", "bold"),
+    ):
+        chosen = [one for one in findings if one.level == level]
+        if not chosen:
+            continue
+        console.print()
+        console.print(Text(title, style=style))
+        for number, one in enumerate(chosen, 1):
+            grid = Table.grid(padding=(0, 1, 0, 0))
+            grid.add_column(width=3, no_wrap=True, justify="right")
+            grid.add_column(overflow="fold")
+            grid.add_row(Text(f"{number}."), Text(_sentence(one.text)))
+            if one.remedy:
+                grid.add_row(Text("->", style="green"), Text(one.remedy))
+            console.print(Padding(grid, (0, 0, 0, 1)))
+    console.print()
+    style = {"r": "bold green", "c": "bold yellow"}[conclusion[0]] if "cannot" not in conclusion else "bold red"
+    console.print(Text(conclusion, style=style))
+
+
+def _sections(facts: "Facts") -> Iterator[tuple[str, Rows]]:
+    yield "Files", list(_files(facts))
+    yield "Channels", list(_channels(facts))
+    yield f"Light (of frames {', '.join(map(str, facts.read))})", list(_light(facts))
+    yield "Guides", list(_guides(facts))
+    yield "Motion", list(_motion(facts))
+    seconds = facts.needs.seconds
+    whole = terminal.duration(seconds * len(facts.scan.there))
+    time = f"about {whole}, {seconds:.2g} s a frame, on two cores, after compiling"
+    needs = (terminal.size(amount) for amount in (facts.needs.memory, facts.needs.disk))
+    yield "A run", [("time", time), *zip(("memory", "disk"), (f"at most about {need}" for need in needs), strict=True)]
+
+
+def _files(facts: "Facts") -> Iterator[tuple[str, str]]:
+    from svgf_jax.sequences import format_range
+
+    scan = facts.scan
+    gaps = f"{format_range(scan.missing)} missing" if scan.missing else "none missing"
+    yield "frames", f"{len(scan.there)} ({format_range(scan.there)}), {gaps}"
+    crop = "a crop of a larger picture" if facts.crop else "data window = display window"
+    yield "size", f"{facts.size[0]} x {facts.size[1]}, {crop}"
+    saved = f", {scan.pixels / scan.stored:.1f} : 1" if scan.stored else ""
+    yield "stored", f"{terminal.size(scan.stored)}, {scan.compression or 'unknown compression'}{saved}"
+    spp = "the header does not say" if facts.samples is None else f"{facts.samples[1]:g} (attribute {facts.samples[0]})"
+    yield "samples", spp
+
+
+def _channels(facts: "Facts") -> Iterator[tuple[str, str]]:
+    from svgf_jax.roles import short_names
+
+    yield "names", facts.table.title
+    for role, layer in facts.roles.layers.items():
+        meaning = f"; {layer.meaning}" if layer.meaning else ""
+        yield role, f"{short_names(layer.channels)}, {facts.scan.types.get(role, '')} ({layer.reason}{meaning})"
+    for role, default in facts.roles.absent.items():
+        yield role, f"not there, taken as {default}"
+    if unused := facts.scan.unused:
+        yield "not used", " ".join(unused[:12]) + (f" and {len(unused) - 12} more" if len(unused) > 12 else "")
+
+
+def _light(facts: "Facts") -> Iterator[tuple[str, str]]:
+    for name, light in facts.light.items():
+        level = (
+            "nothing to judge the noise by" if light.noise is None else f"noise {100 * light.noise:.3g} % of the light"
+        )
+        flies = light.fireflies
+        yield (
+            name,
+            f"{level}; fireflies {100 * flies.pixels:.2g} % of the pixels, {100 * flies.light:.2g} % of the light",
+        )
+    if facts.psnr is not None:
+        yield "picture", f"about {facts.psnr:.1f} dB (PSNR that svgf-jax compare would show, by the noise alone)"
+    yield "neighbours", _correlation(facts.correlation, "independent noise", "correlated noise")
+    yield "frames", _correlation(facts.repeated, "independent noise", "the same noise again")
+    broken = [
+        f"{role} {', '.join(f'{count} {kind}' for kind, count in one._asdict().items() if count)}"
+        for role, one in facts.broken.items()
+    ]
+    yield "broken", "; ".join(broken) or "no NaN, no infinity, nothing negative"
+
+
+def _correlation(value: float | None, low: str, high: str) -> str:
+    from svgf_jax.findings import CORRELATED
+
+    if value is None:
+        return "cannot tell: too little noise"
+    return f"{high if value > CORRELATED else low} (correlation {value + 0.0:.2f})"
+
+
+def _guides(facts: "Facts") -> Iterator[tuple[str, str]]:
+    yield "background", f"{100 * facts.background:.3g} % of the pixels"
+    if "normal" in facts.roles.layers:
+        why = "no positions, and no depth with cameras, to compare with"
+        yield "normals", "packed to 0 ... 1" if facts.packed else _fit(facts.normals, why, "{:.2g} degrees")
+    if "depth" in facts.roles.layers:
+        yield "depth", _fit(facts.depth, "no flat surfaces, no positions with cameras", "{:.1g}")
+    rounding = [
+        f"{role}: steps of {value:.2g} {unit}"
+        for role, value, unit in (
+            ("position", facts.halves.position, "of a pixel's distance"),
+            ("motion", facts.halves.motion, "pixels"),
+        )
+        if value is not None
+    ]
+    if rounding:
+        yield "half float", "; ".join(rounding)
+
+
+def _fit(fit: "Fit | None", why: str, form: str) -> str:
+    """`view z (off by 2e-06; ray distance 0.003)`."""
+    if fit is None:
+        return f"cannot tell: {why}"
+    name = " or ".join(fit.best) if fit.best else "none of what is known"
+    if len(fit.best) > 1 and "world space" in fit.best:
+        name = "world space (the camera's axes are the same here)"
+    nearest = sorted(fit.misfit.items(), key=lambda item: item[1])[:2]
+    return f"{name}; off by: {', '.join(f'{other} {form.format(value)}' for other, value in nearest)}"
+
+
+def _motion(facts: "Facts") -> Iterator[tuple[str, str]]:
+    if facts.motion is not None:
+        shown = 0
+        for one, residual in facts.motion.residuals.items():
+            fits = one in facts.motion.fits
+            if residual.judged and (fits or one is None or shown < CONVENTIONS):
+                shown += 1
+                off = f"{residual.pixels:.3g}" if residual.pixels < 4 else "4 or more"
+                yield (
+                    ("fits" if fits else ""),
+                    f"{one or 'no motion at all'}: {off} pixels off (by {', '.join(residual.guides)})",
+                )
+        if not shown:
+            yield "convention", "cannot tell: nothing moves"
+    elif "motion" not in facts.roles.layers:
+        yield "vectors", f"none: {facts.roles.absent.get('motion', 'taken from the cameras')}"
+    if facts.continuity is not None and facts.history is not None:
+        yield (
+            "history",
+            (
+                f"{100 * facts.continuity.share:.3g} % of the surfaces are found in the frame before: "
+                f"{facts.history:.1f} frames long on average over the sequence"
+            ),
+        )
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _record(facts: "Facts") -> dict[str, Any]:
+    """The facts as plain JSON: the convention of motion as words, attributes of the header as text."""
+    record = facts._asdict()
+    record["scan"] = facts.scan._asdict() | {
+        "attributes": {name: str(value) for name, value in facts.scan.attributes.items()}
+    }
+    record["roles"] = {
+        "layers": {role: layer._asdict() for role, layer in facts.roles.layers.items()},
+        "absent": facts.roles.absent,
+        "signals": facts.roles.signals,
+        "renderer": facts.table.name,
+    }
+    del record["table"]
+    if facts.motion is not None:
+        residuals = {str(one or "no motion at all"): residual for one, residual in facts.motion.residuals.items()}
+        record["motion"] = {"fits": [str(one) for one in facts.motion.fits], "residuals": residuals}
+    return record

@@ -1,0 +1,225 @@
+"""What is wrong or odd about a sequence that was inspected, and what to change about it."""
+
+import math
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+from svgf_jax.geometry import RAY_DISTANCE, VIEW_Z, Fit
+from svgf_jax.inspection import Facts, declared
+from svgf_jax.motion import Convention
+from svgf_jax.remedies import remedy
+from svgf_jax.sequences import format_range
+
+CORRELATED = 0.15
+"""Correlation of neighbours' noise from which on it matters: Mitsuba's default filter has 0.37, independent pixels 0."""
+REPEATED = 0.3
+FIREFLIES = 0.15  # share of a signal's light
+CONVERGED = 0.03  # relative noise
+SHORT = 0.8  # share of pixels with history
+
+
+class Finding(NamedTuple):
+    """One thing that an inspection found.
+
+    Attributes:
+        level: "error" (a run would not start), "warning" (to be mended), "note" (to be known).
+        topic: what it is about, a word or two.
+        text: what was found, with numbers.
+        remedy: what to change; "" where there is nothing.
+    """
+
+    level: Literal["error", "warning", "note"]
+    topic: str
+    text: str
+    remedy: str
+
+
+def judge(facts: Facts, *, gaps_allowed: bool = True) -> tuple[Finding, ...]:
+    """All findings, errors first. Without `gaps_allowed`, missing frames are an error."""
+    renderer = facts.table.name
+    found = [*_files(facts, gaps_allowed), *_roles(facts), *_light(facts, renderer), *_guides(facts, renderer)]
+    found += [*_motion(facts), *_history(facts, renderer)]
+    return tuple(sorted(found, key=lambda one: ("error", "warning", "note").index(one.level)))
+
+
+def verdict(findings: tuple[Finding, ...]) -> str:
+    """One line: whether a run would start, and how much there is to mend."""
+    errors, warnings = (sum(one.level == level for one in findings) for level in ("error", "warning"))
+    mend = f"{warnings} thing{'s' * (warnings != 1)} to mend"
+    if errors:
+        return f"cannot run: {errors} error{'s' * (errors != 1)}" + (f", {mend}" if warnings else "")
+    return f"can run, {mend}" if warnings else "ready"
+
+
+def _files(facts: Facts, gaps_allowed: bool) -> Iterator[Finding]:
+    scan = facts.scan
+    for text in scan.damaged.values():
+        yield Finding("error", "files", text, "")
+    if scan.missing:
+        level = "note" if gaps_allowed else "error"
+        text = f"frames {format_range(scan.missing)} are missing."
+        yield Finding(
+            level, "gaps", text, "" if gaps_allowed else "Render them, or go on without: --missing hold|reset."
+        )
+    if len(scan.there) == 1:
+        text = "one frame only: there is no history, and the filter is left with what is around each pixel."
+        yield Finding(
+            "warning", "frames", text, "Give the whole sequence: a folder, or a pattern such as frame_####.exr."
+        )
+    if scan.checked < len(scan.there):
+        yield Finding("note", "files", f"{scan.checked} of {len(scan.there)} headers were read.", "")
+
+
+def _roles(facts: Facts) -> Iterator[Finding]:
+    for role, cost in facts.roles.absent.items():
+        if cost.endswith((" say", " says")):
+            continue
+        level = "note" if role in ("emission", "id") else "warning"
+        setting = facts.table.settings.get(role)
+        switch = f"{facts.table.title}: {setting}." if setting else "Let the renderer write it."
+        other = f"If it is there under another name: --channel {role}=NAMES, or --file {role}=PATTERN."
+        yield Finding(level, f"no {role}", f"{role} is not there, taken as {cost}.", f"{switch} {other}")
+    for text in facts.warnings:
+        if not text.startswith("no "):
+            yield Finding("warning", "reading", text, "")
+
+
+def _light(facts: Facts, renderer: str) -> Iterator[Finding]:
+    levels = [one.noise for one in facts.light.values() if one.noise is not None]
+    if levels and max(levels) < CONVERGED:
+        text = f"hardly any noise: at most {100 * max(levels):.2g} % of the light. Converged, or denoised already."
+        yield Finding("warning", "noise", text, remedy("little noise", renderer))
+    if facts.correlation is not None and facts.correlation > CORRELATED:
+        text = (
+            f"the noise of neighbouring pixels is correlated ({facts.correlation:.2f}; independent pixels have 0): "
+            "a wide pixel filter or a denoiser was at work. The filter will take blotches for detail."
+        )
+        yield Finding("warning", "correlated noise", text, remedy("correlation", renderer))
+    if facts.repeated is not None and facts.repeated > REPEATED:
+        text = (
+            f"the noise is the same in every frame (correlation {facts.repeated:.2f}): averaging frames gains nothing."
+        )
+        yield Finding("warning", "seed", text, remedy("seed", renderer))
+    for name, light in facts.light.items():
+        if light.fireflies.light > FIREFLIES:
+            pixels, share = light.fireflies
+            text = f"{_percent(share)} of the light of {name} is in {_percent(pixels)} of its pixels."
+            yield Finding("warning", "fireflies", text, remedy("fireflies", renderer))
+    for role, (nan, infinite, negative) in facts.broken.items():
+        bright = role in (*facts.roles.light, "emission", "environment")
+        if nan or infinite:
+            kinds = " and ".join(f"{count} {kind}" for count, kind in ((nan, "NaN"), (infinite, "infinite")) if count)
+            text = f"{role}: {kinds} pixel{'s' * (nan + infinite != 1)} in {len(facts.read)} frames."
+            yield Finding(
+                "warning", f"broken {role}", text, remedy("broken light" if bright else "broken guides", renderer)
+            )
+        if negative:
+            text = f"{role}: {negative} negative pixel{'s' * (negative != 1)} in {len(facts.read)} frames."
+            yield Finding("warning", f"negative {role}", text, remedy("negative light", renderer))
+    if facts.halves.clipped:
+        text = f"{facts.halves.clipped} pixels are as bright as half float can be (65504): their light is cut off."
+        yield Finding("warning", "half float", text, remedy("half", renderer))
+
+
+def _guides(facts: Facts, renderer: str) -> Iterator[Finding]:
+    if facts.below > 0.01:
+        text = f"depth is negative in {_percent(facts.below)} of the pixels."
+        yield Finding("warning", "depth sign", text, remedy("depth sign", renderer))
+    if facts.background == 1:
+        text = "no pixel has a surface: everything would pass through unfiltered."
+        yield Finding(
+            "warning", "background", text, "Look at id, alpha, normal and depth: one of them says that nothing was hit."
+        )
+    if facts.packed:
+        text = "normals are packed: from 0 to 1 in place of -1 to 1."
+        yield Finding("warning", "normals", text, remedy("normals packed", renderer))
+    elif (count := facts.repaired.get("normal", 0)) and count > 0.01 * len(facts.read) * math.prod(facts.size):
+        text = f"{count} normals in {len(facts.read)} frames are not of unit length: brought to it."
+        yield Finding("note", "normals", text, "")
+    if facts.normals is not None and not facts.packed:
+        yield from _normals(facts.normals, renderer)
+    if facts.depth is not None and facts.depth.best != (VIEW_Z,):
+        yield from _depth(facts.depth, renderer)
+    halves = facts.halves
+    if halves.position is not None and halves.position > 0.25:
+        text = f"positions in half float are rounded to steps of {halves.position:.2g} of the distance between neighbouring pixels."
+        yield Finding("warning", "half float", text, remedy("half", renderer))
+    if halves.motion is not None and halves.motion > 0.1:
+        text = f"motion in half float is rounded to steps of {halves.motion:.2g} pixels where it is fast."
+        yield Finding("warning", "half float", text, remedy("half", renderer))
+
+
+def _normals(fit: Fit, renderer: str) -> Iterator[Finding]:
+    nearest = min(fit.misfit, key=lambda name: fit.misfit[name])
+    if not fit.best:
+        text = f"normals agree with those of the surfaces in no space ({fit.misfit[nearest]:.0f} degrees off in {nearest})."
+        yield Finding(
+            "warning",
+            "normals",
+            text,
+            "Look at the channels of normal, position and depth: one of them is something else.",
+        )
+    elif "world space" not in fit.best:
+        text = f"normals are in {nearest}, {fit.misfit['world space']:.0f} degrees off those of the surfaces in world space."
+        yield Finding("warning", "normals", text, remedy("normal space", renderer))
+
+
+def _depth(fit: Fit, renderer: str) -> Iterator[Finding]:
+    if len(fit.best) == 1:
+        kind = "the length of the ray" if fit.best[0] == RAY_DISTANCE else "what a z buffer holds"
+        text = f"depth is {kind}, not the distance along the viewing axis: history and edges will be judged wrongly."
+        yield Finding("warning", "depth", text, remedy("depth kind", renderer))
+    elif fit.best:
+        yield Finding("note", "depth", f"cannot tell whether depth is {' or '.join(fit.best)} here.", "")
+    else:
+        text = "depth is neither view z nor the length of a ray: flat surfaces are not flat."
+        yield Finding("warning", "depth", text, remedy("depth kind", renderer))
+
+
+def _motion(facts: Facts) -> Iterator[Finding]:
+    if facts.motion is None:
+        return
+    fits, residuals = facts.motion.fits, facts.motion.residuals
+    if not fits:
+        still = facts.continuity is not None and facts.continuity.still > 0.98
+        if still or not any(one.judged for one in residuals.values()):
+            yield Finding(
+                "note", "motion", "nothing moves: the motion convention cannot be told, and does not matter.", ""
+            )
+            return
+        best = min(_off(facts, one) for one in residuals if one is not None)
+        text = (
+            f"no motion convention fits: {best:.2g} pixels off at best, {_off(facts, None):.2g} without any motion. "
+            "Motion blur, other frames' vectors, or motion that stands for something else?"
+        )
+        yield Finding(
+            "warning",
+            "motion",
+            text,
+            "Look at the channels of motion; with positions and a cameras.json they are not needed.",
+        )
+        return
+    own = declared(facts.roles)
+    if own not in fits:
+        read = " or ".join(f"'{one}'" for one in fits)
+        text = f"motion vectors follow {read} ({_off(facts, fits[0]):.2g} pixels off), not '{own}' ({_off(facts, own):.2g})."
+        yield Finding("warning", "motion", text, f"Say so: --motion '{fits[0]}'.")
+    elif len(fits) > 1:
+        others = ", ".join(f"'{one}'" for one in fits if one != own)
+        yield Finding("note", "motion", f"motion could as well be {others}: these frames do not tell.", "")
+
+
+def _off(facts: Facts, one: Convention | None) -> float:
+    assert facts.motion is not None
+    residual = facts.motion.residuals.get(one)
+    return math.inf if residual is None or math.isnan(residual.pixels) else residual.pixels
+
+
+def _history(facts: Facts, renderer: str) -> Iterator[Finding]:
+    if facts.continuity is not None and facts.continuity.share < SHORT and facts.background < 1:
+        text = f"only {_percent(facts.continuity.share)} of the pixels find their surface in the frame before."
+        yield Finding("warning", "history", text, remedy("history", renderer))
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.1f} %"
