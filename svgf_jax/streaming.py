@@ -94,7 +94,7 @@ def run(
     checkpoint_every: int = 8,
     threads: int = 2,
     on_frame: Callable[[FrameReport], None] = lambda report: None,
-    on_output: Callable[[frames.LoadedFrame, Output], None] = lambda item, output: None,
+    on_output: Callable[[frames.LoadedFrame, Output], object] = lambda item, output: None,
     stop: Callable[[], bool] = lambda: False,
     pipeline: Pipeline | None = None,
 ) -> Summary:
@@ -294,7 +294,7 @@ def _write(
     plan: Plan,
     options: WriteOptions,
     provenance: Mapping[str, str],
-    on_output: Callable[[frames.LoadedFrame, Output], None],
+    on_output: Callable[[frames.LoadedFrame, Output], object],
     index: int,
     item: frames.LoadedFrame,
     output: Output,

@@ -29,7 +29,7 @@ FLOORS = [
     {"variance", "atrous", "adaptation", "roles", "reflections", "preview", "joint_bilateral", "outliers", "matrices"},
     {"planes", "camera_files", "geometry"},
     {"frames", "references", "pipeline", "checkpoint", "page"},
-    {"baselines", "comparison", "film", "outputs", "plan", "scan", "shown"},
+    {"baselines", "comparison", "film", "outputs", "plan", "scan", "shown", "tev"},
     {"compiled", "estimates"},
     {"ablation", "streaming"},
     {"demo", "report", "inspection"},
@@ -79,6 +79,7 @@ NUMPY_ONLY = {
     "preview",
     "page",
     "shown",
+    "tev",
     "report",
     "tonemapping",
 }

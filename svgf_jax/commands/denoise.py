@@ -4,7 +4,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -64,6 +64,8 @@ def denoise(
     tonemap: Annotated[settings.Tonemap, Parameter(group=OUTPUT)] = "reinhard-extended",
     report: Annotated[Path | None, Parameter(metavar="FILE.html", group=OUTPUT)] = None,
     reference: Annotated[str | None, Parameter(metavar="REF", group=OUTPUT)] = None,
+    tev: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
+    tev_address: Annotated[str | None, Parameter(metavar="HOST:PORT", group=OUTPUT)] = None,
     overwrite: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     resume: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     checkpoint_every: Annotated[int, Parameter(metavar="FRAMES", group=RUN)] = 8,
@@ -101,6 +103,8 @@ def denoise(
         tonemap: Tone curve of PNG, video and report.
         report: Also write one page to look at: pictures, maps, curves, and all that was chosen.
         reference: References for the report, paired by number: it then tells the error too.
+        tev: Also send each frame to a running tev viewer (needs the extra `tev`).
+        tev_address: The same, to where tev listens; localhost:14158 if not given.
         overwrite: Replace outputs that exist.
         resume: Continue an interrupted run where its last checkpoint is; the result is the same bit for bit.
         checkpoint_every: Save the history for --resume after so many frames.
@@ -123,6 +127,8 @@ def denoise(
     from svgf_jax.outputs import WriteOptions, numbers
     from svgf_jax.references import pair_references
     from svgf_jax.scan import require_sound, scan_files
+    from svgf_jax.tev import ADDRESS
+    from svgf_jax.tev import tev as send_to_tev
 
     source = open_source(
         input_,
@@ -162,7 +168,15 @@ def denoise(
         if json:
             terminal.print_json(told | {"method": method, "preset": chosen_preset} | numbers(chosen, config))
         return 0
-    with _until_interrupted() as interruption, terminal.progress(len(source.sequence.files)) as on_frame:
+    viewer = nullcontext()
+    if tev or tev_address is not None:
+        viewer = send_to_tev(tev_address or ADDRESS, tell=lambda text: terminal.warn([text]))
+    watch = None if shown is None else reports.watch(shown)
+    with (
+        viewer as send,
+        _until_interrupted() as interruption,
+        terminal.progress(len(source.sequence.files)) as on_frame,
+    ):
         summary = streaming.run(
             source,
             out,
@@ -179,7 +193,7 @@ def denoise(
             checkpoint_every=checkpoint_every,
             on_frame=on_frame,
             stop=lambda: bool(interruption),
-            on_output=reports.watch(shown) if shown is not None else lambda item, output: None,
+            on_output=lambda item, output: [look(item, output) for look in (watch, send) if look is not None],
         )
     _conclude(summary, verbose=verbose)
     if report is not None and shown is not None:
