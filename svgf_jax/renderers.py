@@ -58,7 +58,8 @@ class Table(NamedTuple):
     settings: Mapping[str, str] = _NONE
 
 
-NATIVE = Table("native", "the names of svgf_jax itself")
+_OURS = ("direct.R", "indirect.R", "normal.X", "depth.Z", "motion.X", "id.I")
+NATIVE = Table("native", "the names of svgf_jax itself", {"channels": _OURS})
 
 
 def renderer_names() -> tuple[str, ...]:
@@ -104,23 +105,19 @@ def _load(path: Path) -> Table:
 def detect_renderer(channels: Collection[str], attributes: Iterable[str] = (), files: Collection[str] = ()) -> Table:
     """The renderer that wrote a file with these channels and header attributes, among these sequences of files in a folder.
 
-    `NATIVE` if no table says anything, or if native names are there.
+    It is the table of which most lines are there; `NATIVE` if none says more than the native names do.
     """
-    if any(name.startswith(("direct.", "indirect.", "normal.X", "depth.Z")) for name in channels):
-        return NATIVE
-    best, most = NATIVE, 0
-    for name in renderer_names()[1:]:
-        table = load_table(name)
-        there = {"channels": channels, "attributes": attributes, "files": files}
-        layer = "*." if table.layered else ""
-        found = 0
-        for kind, lines in table.detect.items():
-            for line in lines:
-                wide = layer + line if kind == "channels" else line
-                found += any(_like(one, line) or _like(one, wide) for one in there[kind])
-        if found > most:
-            best, most = table, found
-    return best
+    there = {"channels": tuple(channels), "attributes": tuple(attributes), "files": tuple(files)}
+    tables = [load_table(name) for name in renderer_names()]
+    found = [
+        sum(_is_there(line, there[kind], table) for kind, lines in table.detect.items() for line in lines)
+        for table in tables
+    ]
+    return tables[found.index(max(found))]
+
+
+def _is_there(line: str, names: Iterable[str], table: Table) -> bool:
+    return any(_like(name, line) or (table.layered and _like(name, f"*.{line}")) for name in names)
 
 
 def layers_of(table: Table, channels: Iterable[str]) -> tuple[str, ...]:

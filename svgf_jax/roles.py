@@ -238,7 +238,7 @@ def _light_apart(layers: dict[str, Layer], channels: Collection[str], table: Tab
         light[signal.name] = Light(f"{signal.name}_albedo" if albedo else "", signal.divided)
     if light:
         layers.pop("albedo", None)
-        if "radiance" in layers and not set(table.complete) <= layers.keys():
+        if "radiance" in layers and not (table.complete and set(table.complete) <= layers.keys()):
             light[REST] = Light("", False)
     return light
 
@@ -271,10 +271,12 @@ def _given(
 
 def _known(role: str, channels: Collection[str], where: str, table: Table, means: str) -> Layer | None:
     """A role by the renderer's names for it; by its native name where its table says nothing of it."""
-    if role not in table.channels:
+    width = _width(role, means)
+    if role not in table.channels and width == WIDTH[role]:
         return _native(role, channels, where)
-    for key, meaning in ((role, ""), (f"camera_{role}", "camera")):
-        names = pick(role, table.channels.get(key, ()), _width(role, means), channels, table=table, where=where)
+    spellings = table.channels.get(role, ("motion.XYZ",))
+    for texts, meaning in ((spellings, ""), (table.channels.get(f"camera_{role}", ()), "camera")):
+        names = pick(role, texts, width, channels, table=table, where=where)
         if names is not None:
             return Layer(names, False, f"{table.name} name", meaning)
     return None
