@@ -101,8 +101,8 @@ def _light(facts: Facts, renderer: str) -> Iterator[Finding]:
         )
         yield Finding("warning", "seed", text, remedy("seed", renderer))
     for name, light in facts.light.items():
-        if light.fireflies.light > FIREFLIES:
-            pixels, share = light.fireflies
+        pixels, share = light.fireflies
+        if share > FIREFLIES and pixels * math.prod(facts.size) >= 10:
             text = f"{_percent(share)} of the light of {name} is in {_percent(pixels)} of its pixels."
             yield Finding("warning", "fireflies", text, remedy("fireflies", renderer))
     for role, (nan, infinite, negative) in facts.broken.items():

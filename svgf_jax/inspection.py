@@ -18,7 +18,7 @@ from svgf_jax.renderers import Table
 from svgf_jax.roles import Roles
 from svgf_jax.scan import Scan, require_sound, samples_per_pixel, scan_files
 from svgf_jax.types import Config, Frame, Params
-from svgf_jax.warping import Step, Verdict, find_convention
+from svgf_jax.warping import Residual, Step, Verdict, find_convention, warp_residual
 
 SIDE = 640  # pixels: of larger pictures, noise, normals, depth and motion are judged in the middle, so many pixels each way
 
@@ -76,6 +76,7 @@ class Facts(NamedTuple):
         normals, depth: what they fit.
         halves: hazards of half floats.
         motion: which conventions the motion vectors fit; None without two frames in a row or motion vectors in screen space.
+        warped: how well the motion that the filter gets leads to the frame before; None without two frames in a row.
         continuity: whether the previous frame has what each pixel shows; None without two frames in a row.
         history: mean history length to expect.
         needs: of a run.
@@ -103,6 +104,7 @@ class Facts(NamedTuple):
     depth: Fit | None
     halves: Halves
     motion: Verdict | None
+    warped: Residual | None
     continuity: geometry.Continuity | None
     history: float | None
     needs: Estimate
@@ -154,7 +156,7 @@ def inspect_source(source: Source, *, params: Params = Params(), config: Any = C
         warnings=told_once([*source.warnings, *(note for one in read.values() for note in one.loaded.notes)]),
         size=(width, height),
         crop=source.data_window != source.display_window,
-        samples=samples_per_pixel(scan.attributes),
+        samples=samples_per_pixel(scan.attributes, like=_layer(source.roles)),
         read=tuple(one.loaded.number for one in read.values()),
         light={
             name: Light(
@@ -177,10 +179,16 @@ def inspect_source(source: Source, *, params: Params = Params(), config: Any = C
         motion=None
         if declared(source.roles).unit == "world"
         else _motion(steps, (screen_right - screen_left + 1, screen_bottom - screen_top + 1)),
+        warped=_warped(steps),
         continuity=None if share is None or still is None else geometry.Continuity(share, still),
         history=None if share is None else geometry.expected_length(share, frames=len(scan.there), most=most),
         needs=estimate(scan, pixels=width * height, signals=len(source.roles.signals), config=config),
     )
+
+
+def _layer(roles: Roles) -> str:
+    """What stands before the radiance's channels: a view layer's name, for renderers that have them."""
+    return roles.layers[roles.signals[0]].channels[0].partition(".")[0] if roles.signals[0] in roles.layers else ""
 
 
 def declared(roles: Roles) -> Convention:
@@ -332,6 +340,13 @@ def _motion(steps: list[tuple[_Read, _Read]], size: tuple[int, int]) -> Verdict 
     if not steps or "motion" not in steps[0][1].planes:
         return None
     return find_convention([Step(a.frame, b.frame, b.inner["motion"], a.inner["motion"]) for a, b in steps], size=size)
+
+
+def _warped(steps: list[tuple[_Read, _Read]]) -> Residual | None:
+    """Of the pair that is worse off."""
+    found = [warp_residual(a.frame, b.frame, np.asarray(b.frame.motion)) for a, b in steps]
+    told = [one for one in found if np.isfinite(one.pixels)]
+    return max(told, key=lambda one: one.pixels) if told else None
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

@@ -79,11 +79,12 @@ def require_sound(scan: Scan) -> None:
         raise SvgfError("\n".join([*scan.damaged.values()][:3]) + (f"\nand {more} more like this." if more > 0 else ""))
 
 
-def samples_per_pixel(attributes: Mapping[str, Any]) -> tuple[str, float] | None:
+def samples_per_pixel(attributes: Mapping[str, Any], *, like: str = "") -> tuple[str, float] | None:
     """(attribute, samples) where a header says how many samples a pixel has: pbrt, Cycles, and whoever calls it so.
 
-    Cycles has one for each view layer; the first is taken.
+    Of several, such as Cycles has for its view layers, the first with `like` in its name is taken.
     """
+    found = []
     for name, value in attributes.items():
         if re.search(r"(?i)(^|[^a-z])(spp|samples|samples_?per_?pixel|sample_?count|aa_?samples)$", name):
             try:
@@ -91,8 +92,8 @@ def samples_per_pixel(attributes: Mapping[str, Any]) -> tuple[str, float] | None
             except (TypeError, ValueError):
                 continue
             if 0 < number < 1e9:
-                return name, number
-    return None
+                found.append((name, number))
+    return next((one for one in found if like in one[0]), found[0] if found else None)
 
 
 def _check_file(source: Source, index: int) -> dict[str, Header]:

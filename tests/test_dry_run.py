@@ -117,6 +117,12 @@ def test_samples_per_pixel_as_renderers_write_them(attributes, samples):
     assert samples_per_pixel(attributes) == samples
 
 
+def test_samples_are_those_of_the_layer():
+    attributes = {"cycles.Other.samples": "2", "cycles.ViewLayer.samples": "64"}
+    assert samples_per_pixel(attributes, like="ViewLayer") == ("cycles.ViewLayer.samples", 64)
+    assert samples_per_pixel(attributes, like="R") == ("cycles.Other.samples", 2)
+
+
 def test_amounts_are_short_and_plain():
     assert [terminal.size(n) for n in (0, 999, 5_230, 123_456_789, 2.5e12)] == [
         "0 bytes",

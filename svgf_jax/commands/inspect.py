@@ -16,7 +16,6 @@ Flag = Parameter(negative=(), show_default=False)
 Repeated = Parameter(negative=(), consume_multiple=False, show_default=False)
 INPUT, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["Input", "Output"]))
 CONVENTIONS = 4  # motion conventions that are shown besides those that fit
-LABEL = 12  # columns
 Rows = list[tuple[str, str]]
 
 
@@ -83,12 +82,14 @@ def _print(facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str) -> 
 
     console = Console(highlight=False)
     console.print(Text(facts.name, style="bold"))
-    for title, rows in _sections(facts):
+    sections = [(title, rows) for title, rows in _sections(facts) if rows]
+    width = max(len(label) for _, rows in sections for label, _ in rows)
+    for title, rows in sections:
         grid = Table.grid(padding=(0, 2, 0, 0))
-        grid.add_column(width=LABEL, no_wrap=True)
+        grid.add_column(width=width, no_wrap=True)
         grid.add_column(overflow="fold")
         for label, text in rows:
-            grid.add_row(Text(label, style="cyan", overflow="ellipsis"), Text(text))
+            grid.add_row(Text(label, style="cyan"), Text(text))
         console.print()
         console.print(Text(title, style="bold"))
         console.print(Padding(grid, (0, 0, 0, 2)))
@@ -118,7 +119,7 @@ def _print(facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str) -> 
 def _sections(facts: "Facts") -> Iterator[tuple[str, Rows]]:
     yield "Files", list(_files(facts))
     yield "Channels", list(_channels(facts))
-    yield f"Light (of frames {', '.join(map(str, facts.read))})", list(_light(facts))
+    yield f"Light (frame{'s' * (len(facts.read) > 1)} {', '.join(map(str, facts.read))})", list(_light(facts))
     yield "Guides", list(_guides(facts))
     yield "Motion", list(_motion(facts))
     seconds = facts.needs.seconds
@@ -145,26 +146,35 @@ def _files(facts: "Facts") -> Iterator[tuple[str, str]]:
 def _channels(facts: "Facts") -> Iterator[tuple[str, str]]:
     from svgf_jax.roles import short_names
 
+    roles = facts.roles
     yield "names", facts.table.title
-    for role, layer in facts.roles.layers.items():
+    for role, layer in roles.layers.items():
+        if role.removesuffix("_albedo") in roles.light and role.endswith("_albedo"):
+            continue  # stands in its light's line
+        by = roles.layers.get(f"{role}_albedo")
+        names = short_names(layer.channels) + (f", albedo {short_names(by.channels)}" if by else "")
         meaning = f"; {layer.meaning}" if layer.meaning else ""
-        yield role, f"{short_names(layer.channels)}, {facts.scan.types.get(role, '')} ({layer.reason}{meaning})"
-    for role, default in facts.roles.absent.items():
-        yield role, f"not there, taken as {default}"
-    if unused := facts.scan.unused:
-        yield "not used", " ".join(unused[:12]) + (f" and {len(unused) - 12} more" if len(unused) > 12 else "")
+        yield role, f"{names}, {facts.scan.types.get(role, '')} ({layer.reason}{meaning})"
+    for role, default in roles.absent.items():
+        yield role, f"not there{':' if default.endswith((' say', ' says')) else ', taken as'} {default}"
+    stems: dict[str, list[str]] = {}
+    for name in facts.scan.unused:
+        stems.setdefault(name.rpartition(".")[0], []).append(name)
+    unused = [short_names(tuple(names)) for names in stems.values()]
+    if unused:
+        yield "not used", ", ".join(unused[:10]) + (f" and {len(unused) - 10} more" if len(unused) > 10 else "")
 
 
 def _light(facts: "Facts") -> Iterator[tuple[str, str]]:
     for name, light in facts.light.items():
-        level = (
-            "nothing to judge the noise by" if light.noise is None else f"noise {100 * light.noise:.3g} % of the light"
+        level = "hardly any light" if light.noise is None else f"noise {100 * light.noise:.3g} % of the light"
+        pixels, share = light.fireflies
+        flies = (
+            f"fireflies {100 * pixels:.2g} % of the pixels, {100 * share:.2g} % of the light"
+            if pixels
+            else "no fireflies"
         )
-        flies = light.fireflies
-        yield (
-            name,
-            f"{level}; fireflies {100 * flies.pixels:.2g} % of the pixels, {100 * flies.light:.2g} % of the light",
-        )
+        yield name, f"{level}; {flies}"
     if facts.psnr is not None:
         yield "picture", f"about {facts.psnr:.1f} dB (PSNR that svgf-jax compare would show, by the noise alone)"
     yield "neighbours", _correlation(facts.correlation, "independent noise", "correlated noise")
@@ -180,7 +190,7 @@ def _correlation(value: float | None, low: str, high: str) -> str:
     from svgf_jax.findings import CORRELATED
 
     if value is None:
-        return "cannot tell: too little noise"
+        return "cannot tell: too few pixels with noise"
     return f"{high if value > CORRELATED else low} (correlation {value + 0.0:.2f})"
 
 
@@ -228,8 +238,9 @@ def _motion(facts: "Facts") -> Iterator[tuple[str, str]]:
                 )
         if not shown:
             yield "convention", "cannot tell: nothing moves"
-    elif "motion" not in facts.roles.layers:
-        yield "vectors", f"none: {facts.roles.absent.get('motion', 'taken from the cameras')}"
+    if facts.warped is not None and facts.warped.judged:
+        whose = "as read" if "motion" in facts.roles.layers else "by cameras"
+        yield whose, f"{facts.warped.pixels:.3g} pixels off (by {', '.join(facts.warped.guides)})"
     if facts.continuity is not None and facts.history is not None:
         yield (
             "history",
