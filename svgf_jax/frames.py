@@ -7,13 +7,14 @@ what is not finite in it the filter repairs and counts.
 
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from svgf_jax import exr, renderers
+from svgf_jax.advising import advice
 from svgf_jax.camera_files import find_cameras
 from svgf_jax.cameras import (
     Cameras,
@@ -170,7 +171,7 @@ def open_source(
         types = own[role][1].channels if one.own_file else header.channels
         if np.dtype(np.float16) in {types[name] for name in one.channels}:
             half.add(role)
-    told = tuple(_warnings(roles, half, found, table))
+    told = tuple(advice(roles, half, found, table._replace(uncertain=()) if meaning else table))
     return Source(
         sequence,
         roles,
@@ -399,20 +400,3 @@ def _stack(image: exr.Image, channels: tuple[str, ...]) -> np.ndarray:
     """`[H, W, C]` float32, or float64 for 32-bit integers, which float32 does not hold."""
     planes = np.stack([image.channels[name] for name in channels], -1)
     return planes.astype(np.float64 if planes.dtype == np.uint32 else np.float32)
-
-
-def _warnings(roles: Roles, half: set[str], cameras: Cameras | None, table: renderers.Table) -> Iterator[str]:
-    for role in ("albedo", "normal", "depth", "motion"):
-        if role in roles.absent and not (role == "motion" and cameras) and not roles.absent[role].endswith("say"):
-            switch = f" In {table.title}: {table.settings[role]}." if role in table.settings else ""
-            yield f"no {role}: taken as {roles.absent[role]}.{switch}"
-    if "camera" in _meaning(roles, "normal") and "or" not in _meaning(roles, "normal") and not cameras:
-        switch = f" In {table.title}: {table.settings['normal']}." if "normal" in table.settings else ""
-        yield f"normals are in camera space, and no camera is known: where it turns, history will be lost.{switch}"
-    if _meaning(roles, "depth") == ["distance"] and not cameras:
-        yield "depth is the distance along the ray, and no camera is known to make z of it: slopes will be a little off."
-    for role in ("depth", "position"):
-        if role in half:
-            yield f"{role} is in half float, in steps of 0.1 %: slopes become stairs. Let the renderer write 32-bit."
-    if cameras and not roles.layers.keys() & {"depth", "position"}:
-        yield f"{cameras.path} is of no use without depth or position."

@@ -11,6 +11,7 @@ A table is data. Its keys (all but `title` may be absent):
 - `[meaning]`: role -> what its numbers mean (below), where it is not what this library means.
 - `[[light]]`: a signal of its own: `name`, `channels`, `albedo` (spellings too), `divided = true` if it is already divided by it.
 - `complete`: signals and roles that make up the beauty; where not all of them are there, the rest of it is a signal too.
+- `uncertain`: roles whose meaning is not known for certain; they are taken as this library's own, and that is told.
 - `[settings]`: role -> what to switch on in the renderer to get it.
 
 Meanings: of `motion` a convention (`svgf_jax.motion`); of `depth` "distance" (along the ray, not z); of `normal` and `position`
@@ -55,6 +56,7 @@ class Table(NamedTuple):
     meaning: Mapping[str, str] = _NONE
     light: tuple[Signal, ...] = ()
     complete: tuple[str, ...] = ()
+    uncertain: tuple[str, ...] = ()
     settings: Mapping[str, str] = _NONE
 
 
@@ -90,7 +92,7 @@ def _load(path: Path) -> Table:
         for key in ("meaning", "settings"):
             fields[key] = {role: str(text) for role, text in content.pop(key, {}).items()}
         fields |= {"layered": bool(content.pop("layered", False)), "cameras": str(content.pop("cameras", ""))}
-        fields |= {key: _texts(content.pop(key, ())) for key in ("main", "complete")}
+        fields |= {key: _texts(content.pop(key, ())) for key in ("main", "complete", "uncertain")}
         fields["light"] = tuple(
             Signal(one["name"], _texts(one["channels"]), _texts(one.get("albedo", ())), bool(one.get("divided", False)))
             for one in content.pop("light", ())

@@ -1,0 +1,43 @@
+"""What is said of a sequence before it is read: what is missing, what that costs, and what to switch on in the renderer."""
+
+from collections.abc import Collection, Iterator
+
+from svgf_jax.cameras import Cameras
+from svgf_jax.motion import parse_convention
+from svgf_jax.renderers import Table
+from svgf_jax.roles import Roles
+
+
+def advice(roles: Roles, half: Collection[str], cameras: Cameras | None, table: Table) -> Iterator[str]:
+    """What the user should know before the work starts, as sentences.
+
+    Args:
+        roles: which channel plays which role.
+        half: the roles that are stored in half float.
+        cameras: if there are any.
+        table: the renderer's, which says what to switch on.
+    """
+
+    def switch_on(role: str) -> str:
+        return f" In {table.title}: {table.settings[role]}." if role in table.settings else ""
+
+    for role in ("albedo", "normal", "depth", "motion"):
+        if role in roles.absent and not (role == "motion" and cameras) and not roles.absent[role].endswith("say"):
+            yield f"no {role}: taken as {roles.absent[role]}.{switch_on(role)}"
+    for role in set(table.uncertain) & roles.layers.keys():
+        yield (
+            f"what {role} means in files of {table.title} is not certain; taken as {parse_convention(roles.layers[role].meaning)}. "
+            f"`svgf-jax inspect` measures it; say it with --{role}."
+        )
+    means = {role: layer.meaning.split() for role, layer in roles.layers.items()}
+    if not cameras and "camera" in means.get("normal", ()) and "or" not in means["normal"]:
+        yield (
+            f"normals are in camera space, and no camera is known: where it turns, history will be lost.{switch_on('normal')}"
+        )
+    if not cameras and means.get("depth") == ["distance"]:
+        yield "depth is the distance along the ray, and no camera is known to make z of it: slopes will be a little off."
+    for role in ("depth", "position"):
+        if role in half:
+            yield f"{role} is in half float, in steps of 0.1 %: slopes become stairs. Let the renderer write 32-bit."
+    if cameras and not roles.layers.keys() & {"depth", "position"}:
+        yield f"{cameras.path} is of no use without depth or position."
