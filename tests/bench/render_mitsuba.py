@@ -104,14 +104,12 @@ def matrix(transform):
 def matrices(sensor):
     """world_to_camera (x right, y down, z forward) and camera_to_screen (pixels) of a perspective sensor."""
     film, params = sensor.film(), mi.traverse(sensor)
-    size, crop = film.size(), film.crop_size()
-    flip = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's camera looks along z, with x to the left and y up
-    to_world = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
+    flip = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's camera has x to the left and y up
     view = mi.perspective_projection(
-        size, crop, film.crop_offset(), params["x_fov"], sensor.near_clip(), sensor.far_clip()
+        film.size(), film.crop_size(), film.crop_offset(), params["x_fov"], sensor.near_clip(), sensor.far_clip()
     )
-    view = np.array(view.matrix, np.float64).reshape(4, 4)
-    return flip @ np.linalg.inv(to_world), np.diag([*size, 1.0, 1.0]) @ view @ flip
+    to_world, view = (np.array(one.matrix, np.float64).reshape(4, 4) for one in (params["to_world"], view))
+    return flip @ np.linalg.inv(to_world), np.diag([*film.size(), 1.0, 1.0]) @ view @ flip
 
 
 # One scene whose parameters change: loading it anew would number the shapes anew, and no object would have a history.
