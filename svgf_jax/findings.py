@@ -1,6 +1,8 @@
 """What is wrong or odd about a sequence that was inspected, and what to change about it."""
 
+import difflib
 import math
+import shlex
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
@@ -8,6 +10,7 @@ from svgf_jax.geometry import RAY_DISTANCE, VIEW_Z, Fit
 from svgf_jax.inspection import Facts, declared
 from svgf_jax.motion import Convention
 from svgf_jax.remedies import remedy
+from svgf_jax.roles import WIDTH
 from svgf_jax.sequences import format_range
 
 CORRELATED = 0.15
@@ -77,11 +80,26 @@ def _roles(facts: Facts) -> Iterator[Finding]:
         level = "note" if role in ("emission", "id") else "warning"
         setting = facts.table.settings.get(role)
         switch = f"{facts.table.title}: {setting}." if setting else "Let the renderer write it."
-        other = f"If it is there under another name: --channel {role}=NAMES, or --file {role}=PATTERN."
-        yield Finding(level, f"no {role}", f"{role} is not there, taken as {cost}.", f"{switch} {other}")
+        yield Finding(
+            level, f"no {role}", f"no {role}: taken as {cost}.", f"{switch} {_elsewhere(role, facts.scan.unused)}"
+        )
     for text in facts.warnings:
         if not text.startswith("no "):
             yield Finding("warning", "reading", text, "")
+
+
+def _elsewhere(role: str, unused: tuple[str, ...]) -> str:
+    """How to name the channels of a role, with those that are called much like it."""
+    stems: dict[str, list[str]] = {}
+    for name in unused:
+        stems.setdefault(name.rpartition(".")[0] or name, []).append(name)
+    of_width = {stem.rpartition(".")[2]: names for stem, names in stems.items() if len(names) >= WIDTH[role]}
+    close = difflib.get_close_matches(role, of_width, n=1, cutoff=0.6)
+    if not close:
+        return f"If it is there under another name: --channel {role}=NAMES, or --file {role}=PATTERN."
+    names = sorted(of_width[close[0]], key=lambda name: "RGBXYZUVA".find(name[-1]))[: WIDTH[role]]
+    given = f"{role}={','.join(names)}"
+    return f"Or is it this: --channel {shlex.quote(given)}?"
 
 
 def _light(facts: Facts, renderer: str) -> Iterator[Finding]:
@@ -105,16 +123,17 @@ def _light(facts: Facts, renderer: str) -> Iterator[Finding]:
         if share > FIREFLIES and pixels * math.prod(facts.size) >= 10:
             text = f"{_percent(share)} of the light of {name} is in {_percent(pixels)} of its pixels."
             yield Finding("warning", "fireflies", text, remedy("fireflies", renderer))
+    frames = f"{len(facts.read)} frame{'s' * (len(facts.read) != 1)}"
     for role, (nan, infinite, negative) in facts.broken.items():
         bright = role in (*facts.roles.light, "emission", "environment")
         if nan or infinite:
             kinds = " and ".join(f"{count} {kind}" for count, kind in ((nan, "NaN"), (infinite, "infinite")) if count)
-            text = f"{role}: {kinds} pixel{'s' * (nan + infinite != 1)} in {len(facts.read)} frames."
+            text = f"{kinds} pixel{'s' * (nan + infinite != 1)} of {role} in {frames}."
             yield Finding(
                 "warning", f"broken {role}", text, remedy("broken light" if bright else "broken guides", renderer)
             )
         if negative:
-            text = f"{role}: {negative} negative pixel{'s' * (negative != 1)} in {len(facts.read)} frames."
+            text = f"{negative} negative pixel{'s' * (negative != 1)} of {role} in {frames}."
             yield Finding("warning", f"negative {role}", text, remedy("negative light", renderer))
     if facts.halves.clipped:
         text = f"{facts.halves.clipped} pixels are as bright as half float can be (65504): their light is cut off."

@@ -24,7 +24,7 @@ REMEDIES: dict[str, dict[str, str]] = {
         "cycles": "Render > Light Paths > Clamping > Indirect Light (10, say), or clamp here: --set outlier_radius=3.",
         "arnold": "Lower indirect_sample_clamp, or clamp here: --set outlier_radius=3.",
         "pbrt": 'Film "float maxcomponentvalue" (20, say), or clamp here: --set outlier_radius=3.',
-        "karma": "Lower the colour limit of indirect light, or clamp here: --set outlier_radius=3.",
+        "karma": "Lower Color Limit, or clamp here: --set outlier_radius=3.",
     },
     "little noise": {
         "": "Give the renderer's noisy picture: a denoised one has lost what the filter goes by, a converged one needs no filter.",

@@ -72,7 +72,9 @@ LETTERS = {
 }
 
 
-def write_room(folder, numbers=range(4), *, change=None, cameras=True, drop=(), half=(), attributes=None, **options):
+def write_room(
+    folder, numbers=range(4), *, change=None, cameras=True, drop=(), half=(), rename=None, attributes=None, **options
+):
     """Write frames `room.NNNN.exr` of `room`, after `change(number, planes)`; returns the folder."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -85,6 +87,7 @@ def write_room(folder, numbers=range(4), *, change=None, cameras=True, drop=(), 
             if role not in drop:
                 for at, letter in enumerate(letters):
                     name = letter if role == "radiance" else f"{role}.{letter}"
+                    name = name.replace(*rename) if rename else name
                     channels[name] = planes[role][..., at].astype(np.float16 if role in half else np.float32)
         exr.write(folder / f"room.{number:04d}.exr", exr.new_image(channels, attributes=attributes))
     if cameras:

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from svgf_jax.findings import Finding, judge, verdict
 from svgf_jax.frames import open_source
 from svgf_jax.inspection import inspect_source
 from svgf_jax.remedies import REMEDIES, remedy
+from svgf_jax.types import Config, Params
 
 
 def inspected(folder, **options):
@@ -146,6 +148,13 @@ CASES = {
         "32-bit",
     ),
     "changing ids": ({"change": renumber}, {}, "history", "only 0 %", "ids"),
+    "misspelt": (
+        {"rename": ("albedo", "albdo [b]")},
+        {},
+        "no albedo",
+        "will blur",
+        "'albedo=albdo [b].R,albdo [b].G,albdo [b].B'",
+    ),
     "no surface": ({"change": empty}, {}, "background", "no pixel has a surface", "id, alpha"),
     "no motion": ({"drop": ["motion"], "cameras": False}, {}, "no motion", "trails", "--channel motion"),
     "ids in half": ({"change": many, "half": ["id"]}, {}, "reading", "above 2048", ""),
@@ -279,3 +288,27 @@ def test_a_verdict_counts():
     assert verdict((warning, note)) == "can run, 1 thing to mend"
     assert verdict((error, warning, warning)) == "cannot run: 1 error, 2 things to mend"
     assert verdict((error, error)) == "cannot run: 2 errors"
+
+
+DOCS = Path(__file__).parents[1] / "svgf_jax" / "docs"
+
+
+def test_the_page_shows_what_it_prints(capsys):
+    """Labels and sentences; numbers may differ in their last digit."""
+    page = (DOCS / "inspect.md").read_text(encoding="utf-8")
+    shown = re.search(r"```text\n(.*?)```", page, flags=re.DOTALL).group(1)
+    out = run(capsys, "inspect", sample(), "--motion", "y-up")[1]
+    words = [re.sub(r"\S*/\S*/\S*|[-\d.e]+", "", text).split() for text in (shown, out)]
+    assert words[0] == words[1]
+
+
+@pytest.mark.parametrize("name", ["inspect.md", "troubleshooting.md"])
+def test_links_and_flags_of_the_pages_are_real(name, capsys):
+    page = (DOCS / name).read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page):
+        assert (DOCS / target).exists(), target
+    known = run(capsys, "denoise", "--help")[1] + run(capsys, "inspect", "--help")[1]
+    for flag in set(re.findall(r"(--[a-z][a-z-]*)", page)):
+        assert flag in known, flag
+    for parameter in set(re.findall(r"--set (\w+)=", page)):
+        assert parameter in (*Params._fields, *Config._fields), parameter
