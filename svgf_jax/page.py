@@ -45,6 +45,12 @@ class Line(NamedTuple):
     y: Sequence[float]
 
 
+class Raw(NamedTuple):
+    """A cell of a table that is HTML already."""
+
+    html: str
+
+
 class Shown(NamedTuple):
     """A frame in the viewer.
 
@@ -95,9 +101,11 @@ def write(path: Path, text: str) -> None:
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[object]], *, words: bool = False) -> str:
-    """A table; a cell is text or (class, text). Numbers stand to the right, `words` to the left."""
+    """A table; a cell is text, (class, text) or `Raw`. Numbers stand to the right, `words` to the left."""
 
     def cell(content: object) -> str:
+        if isinstance(content, Raw):
+            return f"<td>{content.html}</td>"
         name, text = content if isinstance(content, tuple) else ("", content)
         return f'<td class="{name}">{escape(text)}</td>' if name else f"<td>{escape(text)}</td>"
 
@@ -117,13 +125,15 @@ def plot(
     *,
     title: str,
     frames: Sequence[int] = (),
+    marked: bool = True,
     follow: bool = False,
     log: bool = False,
 ) -> str:
     """A figure with an SVG of lines; "" where no point is finite.
 
-    `frames`: x is the number of one of these frames, and a line shows which one the viewer shows. `follow`: only the lines
-    of the two pictures that it compares are there. `log`: y is shown as its logarithm, and what is not above 0 is left out.
+    `frames`: x is the number of one of these frames, and where `marked` a line shows which one the viewer shows. `follow`:
+    only the lines of the two pictures that it compares are there. `log`: y is shown as its logarithm, and what is not
+    above 0 is left out.
     """
     width, height, left, right, top, bottom = 440, 200, 52, 12, 10, 24
     drawn = [
@@ -149,7 +159,11 @@ def plot(
     def down(y: float) -> float:
         return height - bottom - (y - y0) / (y1 - y0) * (height - bottom - top)
 
-    data = f' data-x0="{x0:.9g}" data-x1="{x1:.9g}" data-from="{left}" data-to="{width - right}"' if frames else ""
+    data = (
+        f' data-x0="{x0:.9g}" data-x1="{x1:.9g}" data-from="{left}" data-to="{width - right}"'
+        if frames and marked
+        else ""
+    )
     parts = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(title)}"{data}>']
     for y in _ticks(y0, y1):
         parts.append(f'<line class="grid" x1="{left}" x2="{width - right}" y1="{down(y):.1f}" y2="{down(y):.1f}"/>')
@@ -157,7 +171,7 @@ def plot(
         parts.append(f'<text x="{left - 5}" y="{down(y) + 4:.1f}" text-anchor="end">{shown}</text>')
     for x in _ticks(x0, x1, whole=bool(frames)):
         parts.append(f'<text x="{across(x):.1f}" y="{height - 7}" text-anchor="middle">{x:.6g}</text>')
-    if frames:
+    if frames and marked:
         parts.append(f'<line class="now" x1="{left}" x2="{left}" y1="{top}" y2="{height - bottom}"/>')
     for i, (name, own) in enumerate(drawn):
         at = [(f"{across(x):.1f}", f"{down(y):.1f}", f"{name} {x:.6g}: {10**y if log else y:.5g}") for x, y in own]

@@ -1,19 +1,23 @@
 """The page about a fit, without fitting anything, and the words about it."""
 
 import io
+import re
 
 import numpy as np
 import pytest
+from browser import opened
 
 from svgf_jax import Config, Params
 from svgf_jax.metrics import Scores
+from tune import report
 from tune.evaluate import Measured, worse
 from tune.explore import Profile, Sensitivity, write_maps
 from tune.fitting import Fit, Iteration
 from tune.free import choose, to_free
 from tune.knowledge import learn
-from tune.report import plot, write_report
-from tune.telling import live
+from tune.report import write_report
+from tune.shots import Shot
+from tune.telling import Comparison, live
 
 
 def made_fit():
@@ -70,9 +74,48 @@ def test_the_page_holds_everything_and_escapes_it(tmp_path):
     assert channels.name == "sensitivity.exr"
 
 
-def test_plots_take_what_is_not_finite_and_what_is_constant():
-    assert "nan" not in plot([("a", [0, 1, 2], [1.0, float("nan"), 1.0])], title="t")
-    assert plot([("a", [0], [float("nan")])], title="t") == ""
+def told(shots, tmp_path, monkeypatch, compared=()):
+    """What a browser shows of the page with pictures: `filtered` gives alpha of the parameters as grey."""
+
+    def filtered(shot, params, config):
+        grey = np.full((6, 9, 3), float(np.asarray(params.alpha).ravel()[0]), np.float32)
+        return ((grey, np.full((6, 9, 3), 0.5, np.float32)) for _ in range(shot.length))
+
+    monkeypatch.setattr(report, "filtered", filtered)
+    maps = Sensitivity(np.ones((4, 6)), np.zeros((3, 4, 6)))
+    page = tmp_path / "page.html"
+    fit = made_fit()._replace(params=Params(alpha=0.4))
+    write_report(page, fit, Params(alpha=0.1), Config(), compared, [], maps, [], shot=shots)
+    look = (
+        "[...document.querySelectorAll('.stage span')].map((span) => span.textContent).join('|') + number.textContent"
+    )
+    return page.read_text(), opened(page, tmp_path, script=f"document.body.dataset.told = {look}")
+
+
+def test_a_second_render_alone_has_pictures_without_scores(tmp_path, monkeypatch):
+    shot = Shot("twice", 3, lambda index: None, numbers=(11, 13, 17))
+    text, dom = told(shot, tmp_path, monkeypatch)
+    assert 'data-told="before|afterframe 13"' in dom
+    assert '<option value="second render">' in text
+    assert "No references were given" in text
+
+
+def test_frames_are_numbered_as_in_the_files_and_errors_are_drawn(tmp_path, monkeypatch):
+    shot = Shot("once", 3, lambda index: None, numbers=(11, 13, 17))
+    before, after = (
+        Measured("once", tuple(Scores(value + i, 0.1, 0.9, 0.1, float("nan")) for i in range(3)), mean, (11, 13, 17))
+        for value, mean in ((30, Scores(31, 0.1, 0.9, 0.1, 0)), (32, Scores(33, 0.1, 0.9, 0.1, 0)))
+    )
+    text, dom = told(shot, tmp_path, monkeypatch, [Comparison("tuned", shot, before, after)])
+    assert "<title>before 11: 30</title>" in text
+    assert re.search(r'data-told="before: [\d.]+ dB\|after: [\d.]+ dBframe 13"', dom)
+    bars = re.findall(r'<svg class="bar".*?</svg>', text)
+    assert ["stroke-dasharray" in bar for bar in bars] == [False, False, True]
+    for bar in bars[:2]:
+        least, most = re.search(r'<line x1="([\d.]+)" x2="([\d.]+)" y1="9"', bar).groups()
+        assert float(least) < float(most)
+        assert "standard error" in bar
+    assert "&plusmn;" not in text
 
 
 def test_worse_is_worse():

@@ -11,22 +11,23 @@ import numpy as np
 from svgf_jax import Config, Params, init, step
 from svgf_jax.metrics import Scores, mean_scores, score_frames
 from svgf_jax.threads import read_ahead
-from tune.shots import Shot
+from tune.shots import Shot, frame_numbers
 
 
 class Measured(NamedTuple):
-    """Scores of a shot: of each frame with a reference, and of the whole."""
+    """Scores of a shot: of each frame with a reference, of the whole, and the numbers of those frames."""
 
     name: str
     frames: tuple[Scores, ...]
     mean: Scores
+    numbers: tuple[int, ...] = ()
 
 
 def measure(shot: Shot, params: Params, config: Config, *, with_flip: bool = False) -> Measured:
     """Denoise a shot whose targets are references, and score it. One frame in memory at a time."""
-    found = score_frames(filtered(shot, params, config), with_flip=with_flip)
-    scores = [score for score in found if score is not None]
-    return Measured(shot.name, tuple(scores), mean_scores(scores))
+    found = zip(frame_numbers(shot), score_frames(filtered(shot, params, config), with_flip=with_flip), strict=True)
+    scores = {number: score for number, score in found if score is not None}
+    return Measured(shot.name, tuple(scores.values()), mean_scores(scores.values()), tuple(scores))
 
 
 def filtered(shot: Shot, params: Params, config: Config) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:

@@ -1,34 +1,22 @@
-"""One self-contained HTML page about a fit: curves, numbers with their errors, scores, pictures. No script but the slider's."""
+"""One self-contained HTML page about a fit: curves, numbers with their errors, scores, pictures."""
 
-import base64
-import html
-import tempfile
-from collections.abc import Sequence
-from itertools import islice
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from svgf_jax import Config, Params, SvgfError
-from svgf_jax.metrics import psnr
-from svgf_jax.preview import to_8bit, write_png
+from svgf_jax import Config, Params, page
+from svgf_jax.page import Line, Raw, Shown
+from svgf_jax.shown import legends, shown_frame
 from tune.evaluate import filtered
 from tune.explore import Profile, Sensitivity
 from tune.fitting import Fit
 from tune.free import natural, to_free
+from tune.shots import Shot, frame_numbers
 from tune.telling import Comparison
 
-_STYLE = """
-body{font:15px/1.5 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222;background:#fff}
-table{border-collapse:collapse;margin:1em 0}td,th{padding:.25em .8em;text-align:right;border-bottom:1px solid #ddd}
-td:first-child,th:first-child{text-align:left}.bad{color:#b00020;font-weight:600}.good{color:#1b6e3c}
-svg{background:#fafafa;border:1px solid #ddd;margin:.4em .4em .4em 0}svg text{font:11px system-ui,sans-serif;fill:#444}
-.pair{position:relative;display:inline-block;line-height:0}.pair img{max-width:100%;image-rendering:auto}
-.pair img+img{position:absolute;left:0;top:0;clip-path:inset(0 50% 0 0)}input[type=range]{width:100%}
-figure{margin:1em 0}.maps figure{display:inline-block;margin:.3em}figcaption{font-size:13px;color:#555}
-"""
-_SLIDER = "this.parentNode.querySelector('img+img').style.clipPath='inset(0 '+(100-this.value)+'% 0 0)'"
-_COLORS = ("#888", "#0b6bcb", "#c4480a", "#1b6e3c")
+FRAMES = 6  # with pictures
+EFOLDS = 3.0  # error bars are never drawn longer than this, to either side
 
 
 def write_report(
@@ -40,189 +28,146 @@ def write_report(
     curves: Sequence[Profile],
     maps: Sensitivity,
     failures: Sequence[str],
+    *,
+    shot: Shot | None = None,
 ) -> None:
-    """Write the page to `path`. Raises SvgfError where that is not possible."""
+    """Write the page to `path`. Pictures are of the first that was compared, else of `shot`, whose targets are noisy.
+
+    Raises SvgfError where the file cannot be written.
+    """
     sections = [
-        f"<h1>svgf-tune</h1><p>{_text(found.result)}. Loss 1 &rarr; {found.loss:.4f}.</p>",
-        *(f'<p class="bad">Validation got worse: {_text(failure)}</p>' for failure in failures),
-        *(f"<p>{_text(note)}</p>" for note in found.notes),
+        f"<h1>svgf-tune</h1><p>{page.escape(found.result)}. Loss 1 &rarr; {found.loss:.4f}.</p>",
+        page.listed((f"Validation got worse: {failure}" for failure in failures), style="bad"),
+        page.listed(found.notes),
         "<h2>Loss</h2>" + _loss_curve(found),
         "<h2>Parameters</h2>" + _parameters(found),
         _scores(compared) if compared else "",
         _frames(compared) if compared else "",
-        _slider(compared[0], start, config, found) if compared else "",
+        _viewer(compared, shot, start, config, found),
         _profiles(curves) if curves else "",
         _maps(found, maps),
     ]
-    page = f"<!doctype html><html lang=en><meta charset=utf-8><title>svgf-tune</title><style>{_STYLE}</style>"
-    try:
-        path.write_text(page + "<body>" + "\n".join(sections) + "</body></html>\n", encoding="utf-8")
-    except OSError as error:
-        raise SvgfError(f"{path}: can't write the report: {error.strerror or error}") from None
-
-
-def plot(
-    lines: Sequence[tuple[str, Sequence[float], Sequence[float]]], *, title: str, size: tuple[int, int] = (460, 220)
-) -> str:
-    """An SVG of lines (name, x, y) with their range on the axes; what is not finite is left out."""
-    width, height, left, bottom, top = *size, 56, 24, 24
-    points = [(x, y) for _, xs, ys in lines for x, y in zip(xs, ys, strict=True) if np.isfinite(y)]
-    if not points:
-        return ""
-    xs, ys = np.array(points, float).T
-    (x0, x1), (y0, y1) = (_range(xs), _range(ys))
-
-    def at(x: float, y: float) -> str:
-        column = left + (x - x0) / (x1 - x0) * (width - left - 12)
-        return f"{column:.1f},{height - bottom - (y - y0) / (y1 - y0) * (height - bottom - top):.1f}"
-
-    parts = [f'<svg width="{width}" height="{height}" role="img" aria-label="{_text(title)}">']
-    parts.append(f'<text x="{left}" y="15">{_text(title)}</text>')
-    parts += [f'<text x="4" y="{y}">{value:.4g}</text>' for y, value in ((top + 8, y1), (height - bottom, y0))]
-    parts += [
-        f'<text x="{x}" y="{height - 8}" text-anchor="{anchor}">{value:.4g}</text>'
-        for x, value, anchor in ((left, x0, "start"), (width - 12, x1, "end"))
-    ]
-    for i, (name, line_x, line_y) in enumerate(lines):
-        color = _COLORS[i % len(_COLORS)]
-        dots = [at(x, y) for x, y in zip(line_x, line_y, strict=True) if np.isfinite(y)]
-        parts.append(f'<polyline points="{" ".join(dots)}" fill="none" stroke="{color}" stroke-width="2"/>')
-        parts += [f'<circle cx="{d.split(",")[0]}" cy="{d.split(",")[1]}" r="2.5" fill="{color}"/>' for d in dots]
-        parts.append(
-            f'<text x="{width - 14}" y="{15 + 13 * i}" text-anchor="end" style="fill:{color}">{_text(name)}</text>'
-        )
-    return "".join(parts) + "</svg>"
+    page.write(path, page.document("svgf-tune", sections))
 
 
 def _loss_curve(found: Fit) -> str:
     lines = []
     for start in sorted({i.start for i in found.iterations}):
         taken = [i for i in found.iterations if i.start == start and i.accepted]
-        lines.append((f"start {start}", [i.number for i in taken], [i.loss for i in taken]))
+        lines.append(Line(f"start {start}", [i.number for i in taken], [i.loss for i in taken]))
     rejected = sum(not i.accepted for i in found.iterations)
-    return (
-        plot(lines, title="accepted trial points")
-        + f"<p>{len(found.iterations)} trial points, {rejected} rejected.</p>"
-    )
+    drawn = page.plot(lines, title="accepted trial points")
+    return f'<div class="plots">{drawn}</div><p>{len(found.iterations)} trial points, {rejected} rejected.</p>'
 
 
 def _parameters(found: Fit) -> str:
     knowledge = found.knowledge
     assert knowledge is not None
-    before = natural(to_free(found.coordinates.start, found.coordinates), found.coordinates)
+    start = to_free(found.coordinates.start, found.coordinates)
+    before, after = (natural(y, found.coordinates) for y in (start, found.y))
+    errors = knowledge.relative_errors
+    reach = np.abs(found.y - start) + np.where(np.isfinite(errors), errors, 0)
+    scale = float(np.clip(reach.max(initial=0.1), 0.1, EFOLDS))
     rows = []
-    for i, (label, value) in enumerate(zip(found.coordinates.labels, natural(found.y, found.coordinates), strict=True)):
-        error = knowledge.standard_errors[i]
-        known = f"&plusmn; {error:.2g}" if np.isfinite(error) else '<span class="bad">undetermined</span>'
-        rows.append((_text(label), f"{before[i]:.4g}", f"{value:.4g}", known, f"{knowledge.leverage[i]:.2g}"))
-    pairs = "".join(f"<p>{_text(a)} and {_text(b)} make up for each other.</p>" for a, b in knowledge.entangled)
-    return _table(("parameter", "before", "after", "standard error", "leverage"), rows) + pairs
+    for i, label in enumerate(found.coordinates.labels):
+        known = f"standard error {knowledge.standard_errors[i]:.2g}" if np.isfinite(errors[i]) else "undetermined"
+        drawn = _bar(found.y[i] - start[i], errors[i], scale, f"{label}: {after[i]:.4g}, {known}")
+        said = "" if np.isfinite(errors[i]) else ("bad", known)
+        rows.append((label, f"{before[i]:.4g}", f"{after[i]:.4g}", Raw(drawn), said, f"{knowledge.leverage[i]:.2g}"))
+    heads = ("parameter", "before", "after", f"moved by, e-folds: -{scale:.2g} to {scale:.2g}", "", "leverage")
+    return (
+        page.table(heads, rows)
+        + "<p>The dot is where the fit ended, seen from where it began (0); the bar is one standard error to either side, dashed "
+        "where the data does not determine the number. An e-fold is a factor of 2.7 (of a blend: of its odds).</p>"
+        + page.listed(f"{a} and {b} make up for each other." for a, b in knowledge.entangled)
+    )
+
+
+def _bar(moved: float, error: float, scale: float, text: str) -> str:
+    """A dot and its error bar on [-scale, scale], as SVG."""
+    least, at, most = (100 + 95 * float(np.clip(x / scale, -1, 1)) for x in (moved - error, moved, moved + error))
+    dashes = "" if np.isfinite(error) else ' stroke-dasharray="4 4"'
+    return (
+        f'<svg class="bar" viewBox="0 0 200 18" role="img" aria-label="{page.escape(text)}"><title>{page.escape(text)}</title>'
+        f'<line class="grid" x1="100" x2="100" y1="0" y2="18"/><g class="k1"><line x1="{least:.1f}" x2="{most:.1f}" y1="9" y2="9" '
+        f'stroke-width="3"{dashes}/><circle cx="{at:.1f}" cy="9" r="4"/></g></svg>'
+    )
 
 
 def _scores(compared: Sequence[Comparison]) -> str:
     rows = []
     for c in compared:
         mark = "good" if c.after.mean.psnr >= c.before.mean.psnr else "bad"
-        row = [f"{_text(c.before.name)} ({c.role})"]
+        row: list[object] = [f"{c.before.name} ({c.role})"]
         for name, form in (("psnr", ".2f"), ("relmse", ".4g"), ("temporal", ".5f"), ("flip", ".4f")):
             before, after = getattr(c.before.mean, name), getattr(c.after.mean, name)
-            row.append("" if np.isnan(after) else f'{before:{form}} &rarr; <span class="{mark}">{after:{form}}</span>')
+            row.append((mark, "" if np.isnan(after) else f"{before:{form}} \N{RIGHTWARDS ARROW} {after:{form}}"))
             mark = ""
         rows.append(row)
-    return "<h2>Before and after</h2>" + _table(("sequence", "PSNR dB", "relMSE", "temporal error", "HDR-FLIP"), rows)
+    return "<h2>Before and after</h2>" + page.table(
+        ("sequence", "PSNR dB", "relMSE", "temporal error", "HDR-FLIP"), rows
+    )
 
 
 def _frames(compared: Sequence[Comparison]) -> str:
     plots = []
-    for c in compared:
+    for i, c in enumerate(compared):
         for name, title in (("psnr", "PSNR dB"), ("temporal", "temporal error")):
-            before, after = ([getattr(s, name) for s in m.frames] for m in (c.before, c.after))
-            x = list(range(len(before)))
-            plots.append(
-                plot(
-                    [("before", x, before), ("after", x, after)], title=f"{title}, {c.role}: {Path(c.before.name).name}"
-                )
-            )
-    return "<h2>Frame by frame</h2>" + "".join(plots)
+            lines = [
+                Line(text, m.numbers, [getattr(s, name) for s in m.frames])
+                for text, m in (("before", c.before), ("after", c.after))
+            ]
+            # The viewer shows frames of the first sequence; the other plots have numbers of their own.
+            shown = f"{title}, {c.role}: {Path(c.before.name).name}"
+            plots.append(page.plot(lines, title=shown, frames=c.before.numbers, marked=i == 0))
+    return f'<h2>Frame by frame</h2><div class="plots">{"".join(plots)}</div>'
 
 
-def _slider(compared: Comparison, start: Params, config: Config, found: Fit) -> str:
-    """Before, after and the reference of the frame that gained most."""
-    gains = [a.psnr - b.psnr for a, b in zip(compared.after.frames, compared.before.frames, strict=True)]
-    best = int(np.nanargmax(gains))
+def _viewer(compared: Sequence[Comparison], shot: Shot | None, start: Params, config: Config, found: Fit) -> str:
+    """Frames before, after and the reference, evenly spread, that which gained most among them; or the second noisy render."""
+    if compared:
+        shot, measured = compared[0].shot, compared[0]
+        gains = [a.psnr - b.psnr for a, b in zip(measured.after.frames, measured.before.frames, strict=True)]
+        chosen = {measured.before.numbers[int(np.nanargmax(gains))]} if not np.isnan(gains).all() else set()
+    elif shot is None:
+        return ""
+    else:
+        chosen = set[int]()
+    chosen |= set(page.evenly(frame_numbers(shot), FRAMES - 1))
 
-    def image(params: Params, config: Config) -> tuple[np.ndarray, np.ndarray]:
-        pictures = ((i, t) for i, t in filtered(compared.shot, params, config) if t is not None)
-        picture, target = next(islice(pictures, best, None))
-        assert target is not None
-        return picture, target
+    def pictures(params: Params, config: Config) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+        for number, pair in zip(frame_numbers(shot), filtered(shot, params, config), strict=True):
+            if number in chosen:
+                yield pair
 
-    (before, target), (after, _) = image(start, config), image(found.params, found.config)
-    one, other, wanted = (_png(to_8bit(picture)) for picture in (before, after, target))
-    names = f"before ({psnr(before, target):.2f} dB, left) and after ({psnr(after, target):.2f} dB, right)"
-
-    def pair(right: str, left: str, caption: str) -> str:
-        return (
-            f'<figure><div><div class="pair"><img src="{right}" alt="right"><img src="{left}" alt="left"></div>'
-            f'<input type="range" value="50" aria-label="{caption}" oninput="{_SLIDER}"></div>'
-            f"<figcaption>{caption}</figcaption></figure>"
-        )
-
-    return (
-        f"<h2>Frame {best} of {_text(compared.before.name)}</h2>"
-        + pair(other, one, names)
-        + pair(wanted, other, "after (left) and reference (right)")
+    shown: list[Shown] = []
+    both = zip(pictures(start, config), pictures(found.params, found.config), strict=True)
+    for number, ((before, target), (after, _)) in zip(sorted(chosen), both, strict=True):
+        every = {"before": before, "after": after}
+        if not compared and target is not None:
+            every["second render"] = target
+        shown.append(shown_frame(number, every, target if compared else None, {}, len(chosen)))
+    other = "" if compared else "<p>No references were given, so that nothing here is measured.</p>"
+    return f"<h2>Pictures of {page.escape(shot.name)}</h2>{other}" + page.viewer(
+        shown, left="before", right="after", legends=legends()
     )
 
 
 def _profiles(curves: Sequence[Profile]) -> str:
     plots = [
-        plot(
-            [("", np.log10(c.values).tolist(), c.losses.tolist())], title=f"loss over log10 {c.label}", size=(310, 180)
-        )
+        page.plot([Line("", np.log10(c.values).tolist(), c.losses.tolist())], title=f"loss over log10 {c.label}")
         for c in curves
     ]
-    return "<h2>Profiles</h2><p>The loss along each parameter, the others held.</p>" + "".join(plots)
+    return f'<h2>Profiles</h2><p>The loss along each parameter, the others held.</p><div class="plots">{"".join(plots)}</div>'
 
 
 def _maps(found: Fit, maps: Sensitivity) -> str:
     figures = []
     scale = max(float(np.quantile(np.abs(maps.slopes), 0.995)), 1e-30)
     for label, plane in zip(found.coordinates.labels, maps.slopes, strict=True):
-        x = np.clip(plane / scale, -1, 1)
-        rgb = np.stack([1 - np.maximum(-x, 0), 1 - np.abs(x), 1 - np.maximum(x, 0)], axis=-1)
-        picture = _png((rgb * 255 + 0.5).astype(np.uint8))
-        name = _text(label)
-        figures.append(
-            f'<figure><img width="310" src="{picture}" alt="{name}"><figcaption>{name}</figcaption></figure>'
-        )
+        picture, name = page.picture(page.signed(plane / scale)), page.escape(label)
+        figures.append(f'<figure><img src="{picture}" alt="{name}"><figcaption>{name}</figcaption></figure>')
     return (
         "<h2>Where each parameter matters</h2><p>Blue: a larger value would make this pixel better; red: worse.</p>"
         f'<div class="maps">{"".join(figures)}</div>'
     )
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{name}</th>" for name in heads)
-    return (
-        f"<table><tr>{head}</tr>"
-        + "".join(f"<tr>{''.join(f'<td>{c}</td>' for c in row)}</tr>" for row in rows)
-        + "</table>"
-    )
-
-
-def _png(picture: np.ndarray) -> str:
-    """`[H, W, 3]` uint8 as a data URL."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "picture.png"
-        write_png(path, np.ascontiguousarray(picture))
-        return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
-
-
-def _range(values: np.ndarray) -> tuple[float, float]:
-    least, most = float(values.min()), float(values.max())
-    return (least, most) if most > least else (least - 0.5, most + 0.5)
-
-
-def _text(text: str) -> str:
-    return html.escape(str(text))

@@ -24,12 +24,19 @@ class Shot(NamedTuple):
         length: number of frames.
         read: index -> `Example` of NumPy arrays; called from other threads, and anew for each pass.
         notes: what the user should know before the work starts, as sentences.
+        numbers: of the frames, as their files have them; () = from 0 on.
     """
 
     name: str
     length: int
     read: Callable[[int], Example]
     notes: tuple[str, ...] = ()
+    numbers: tuple[int, ...] = ()
+
+
+def frame_numbers(shot: Shot) -> tuple[int, ...]:
+    """The frames' numbers."""
+    return shot.numbers or tuple(range(shot.length))
 
 
 def shot_of_arrays(frames: Frame, targets: Any, *, name: str = "frames") -> Shot:
@@ -79,7 +86,7 @@ def shot_of_files(
             return Example(frame, None)
         return Example(frame, read_reference(path, size=frame.depth.shape, number=numbers[index]))
 
-    return Shot(str(noisy), len(numbers), read, (*source.warnings, *lacking))
+    return Shot(str(noisy), len(numbers), read, (*source.warnings, *lacking), tuple(numbers))
 
 
 def window(shot: Shot, *, rows: slice = slice(None), columns: slice = slice(None), frames: slice = slice(None)) -> Shot:
@@ -97,4 +104,4 @@ def window(shot: Shot, *, rows: slice = slice(None), columns: slice = slice(None
         }
         return Example(Frame(**cut), None if target is None else np.ascontiguousarray(target[rows, columns]))
 
-    return shot._replace(length=len(indices), read=read)
+    return shot._replace(length=len(indices), read=read, numbers=frame_numbers(shot)[frames])

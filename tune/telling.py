@@ -1,5 +1,6 @@
 """What a fit says: a line or a live table while it runs, then before and after, what it knows, and the files."""
 
+import importlib.metadata
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -111,7 +112,8 @@ def conclude(
     assert found.knowledge is not None
     record = record | {
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
-        "version": __version__,
+        "versions": {name: importlib.metadata.version(name) for name in ("jax", "optimistix")}
+        | {"svgf_jax": __version__},
         "result": found.result,
         "loss": float(found.loss),
         "tuned": list(found.coordinates.labels),
@@ -146,7 +148,7 @@ def conclude(
     if report is not None and pictures is not None:
         from tune.report import write_report
 
-        write_report(report, found, start, config, compared, curves, pictures, failures)
+        write_report(report, found, start, config, compared, curves, pictures, failures, shot=fitted[0])
         terminal.tell(f"report: {report}")
     if json:
         terminal.print_json(summary(found, compared, curves) | {"out": out, "worse": failures})
