@@ -27,7 +27,9 @@ def read_radiance(path: PathName, *, max_pixels: int = exr.MAX_PIXELS) -> np.nda
         roles = resolve_roles(tuple(image.channels), channel={"radiance": "RGB"}, where=where)
     else:
         table = detect_renderer(image.channels, image.attributes)
-        roles = resolve_roles(in_layer(table, tuple(image.channels), None, where=where), table=table, where=where)
+        only = "Wanted a picture with one of them, or with R, G, B."
+        channels = in_layer(table, tuple(image.channels), None, where=where, choose=only)
+        roles = resolve_roles(channels, table=table, where=where)
 
     def plane(role: str) -> np.ndarray:
         return np.stack([image.channels[name].astype(np.float32) for name in roles.layers[role].channels], -1)

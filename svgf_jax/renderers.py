@@ -4,6 +4,7 @@ A table is data. Its keys (all but `title` may be absent):
 
 - `[detect]`: `channels`, `attributes` (of the header) and `files` (in the frame's folder); the table whose lines match most is it.
 - `layered`: channels have a layer's name in front ("ViewLayer.Combined.R").
+- `other_layers`: layers that are not meant unless they are asked for, or alone.
 - `main`: which of several sequences in a folder holds the radiance, the likeliest first.
 - `cameras`: where cameras are, if not in a cameras.json: `header` or `camera_matrices.h`.
 - `[channels]`: role -> spellings, the best first. "Normal.XYZ" is Normal.X, Normal.Y and Normal.Z; "*" stands for anything.
@@ -49,6 +50,7 @@ class Table(NamedTuple):
     title: str
     detect: Mapping[str, tuple[str, ...]] = _NONE
     layered: bool = False
+    other_layers: tuple[str, ...] = ()
     main: tuple[str, ...] = ()
     cameras: str = ""
     channels: Mapping[str, tuple[str, ...]] = _NONE
@@ -92,7 +94,7 @@ def _load(path: Path) -> Table:
         for key in ("meaning", "settings"):
             fields[key] = {role: str(text) for role, text in content.pop(key, {}).items()}
         fields |= {"layered": bool(content.pop("layered", False)), "cameras": str(content.pop("cameras", ""))}
-        fields |= {key: _texts(content.pop(key, ())) for key in ("main", "complete", "uncertain")}
+        fields |= {key: _texts(content.pop(key, ())) for key in ("main", "complete", "uncertain", "other_layers")}
         fields["light"] = tuple(
             Signal(one["name"], _texts(one["channels"]), _texts(one.get("albedo", ())), bool(one.get("divided", False)))
             for one in content.pop("light", ())
@@ -132,8 +134,13 @@ def layers_of(table: Table, channels: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted(found))
 
 
-def in_layer(table: Table, channels: Collection[str], layer: str | None, *, where: str) -> tuple[str, ...]:
-    """The channels of the layer that is wanted, or of the only one. Raises SvgfError: several, none of that name."""
+def in_layer(
+    table: Table, channels: Collection[str], layer: str | None, *, where: str, choose: str = "Say which: --layer NAME."
+) -> tuple[str, ...]:
+    """The channels of the layer that is wanted, or of the only one. Raises SvgfError: several, none of that name.
+
+    `choose` is what the error says there is to do about several.
+    """
     if not table.layered:
         if layer is not None:
             raise SvgfError(f"Got --layer {layer}, but channels of {table.title} have no layers. Leave it out.")
@@ -141,11 +148,13 @@ def in_layer(table: Table, channels: Collection[str], layer: str | None, *, wher
     there = layers_of(table, channels)
     listed = ", ".join(repr(name) for name in there) or "none"
     if layer is not None and layer not in there:
-        raise SvgfError(f"{where}: no layer {layer!r}; there are {listed}. Say which: --layer NAME.")
-    if layer is None and len(there) > 1:
-        raise SvgfError(f"{where}: {len(there)} view layers: {listed}. Say which: --layer {there[0]}.")
-    name = layer if layer is not None else there[0] if there else ""
-    return tuple(one for one in channels if one.startswith(f"{name}.") or not name)
+        raise SvgfError(f"{where}: no layer {layer!r}; there are {listed}. {choose}")
+    likely = [name for name in there if name not in table.other_layers] or list(there)
+    if layer is None and len(likely) > 1:
+        raise SvgfError(f"{where}: {len(likely)} view layers: {listed}. {choose}")
+    name = layer if layer is not None else likely[0] if likely else ""
+    inner = tuple(f"{other}." for other in there if other != name and (not name or other.startswith(f"{name}.")))
+    return tuple(one for one in channels if (one.startswith(f"{name}.") or not name) and not one.startswith(inner))
 
 
 def spelled(spelling: str, width: int, channels: Iterable[str], *, layered: bool = False) -> Iterator[tuple[str, ...]]:

@@ -51,7 +51,7 @@ def test_the_options_of_the_command(tmp_path, capsys):
 
     code, told = run(MULTIPART / "layers")
     assert code != 0
-    assert "2 view layers: 'Other', 'ViewLayer'. Say which: --layer Other" in " ".join(told.split())
+    assert "2 view layers: 'Other', 'ViewLayer'. Say which: --layer NAME" in " ".join(told.split())
     code, told = run(MULTIPART / "layers", "--layer", "Other")
     assert code == 0, told
     assert "glossy_direct Other.Glossy Direct.RGB, albedo Other.Glossy Color.RGB" in told

@@ -98,15 +98,34 @@ def test_the_convention_of_blender_is_found_from_its_file():
 
 def test_view_layers_are_listed_and_chosen():
     path = DATA / "cycles" / "layers"
-    with pytest.raises(SvgfError, match=r"shot_0001\.exr: 2 view layers: 'Other', 'ViewLayer'\. Say which: --layer"):
+    with pytest.raises(
+        SvgfError, match=r"shot_0001\.exr: 2 view layers: 'Other', 'ViewLayer'\. Say which: --layer NAME"
+    ):
         open_source(path)
     with pytest.raises(SvgfError, match="no layer 'Third'; there are 'Other', 'ViewLayer'"):
         open_source(path, layer="Third")
+    with pytest.raises(SvgfError, match="2 view layers: .* Wanted a picture with one of them"):
+        read_radiance(path / "shot_0001.exr")
     source = open_source(path, layer="Other")
     assert source.roles.layers["depth"].channels == ("Other.Depth.Z",)
     assert source.roles.signals == tuple(KINDS)
     with pytest.raises(SvgfError, match="--layer x, but channels of the names of svgf_jax itself have no layers"):
         open_source(path, layer="x", renderer="native")
+
+
+def test_layers_whose_names_begin_alike_and_the_compositor(tmp_path):
+    channels = (
+        planes("A.Combined", 1, "RGBA") | planes("A.B.Combined", 2, "RGBA") | planes("Composite.Combined", 3, "RGBA")
+    )
+    folder = put(tmp_path, channels, "a_1.exr")
+    with pytest.raises(SvgfError, match="2 view layers: 'A', 'A.B', 'Composite'"):
+        open_source(folder)
+    for layer, value in (("A", 1), ("A.B", 2), ("Composite", 3)):
+        assert (read_frame(open_source(folder, layer=layer), 0).frame.radiance == value).all()
+    put(folder, planes("A.Combined", 1, "RGBA") | planes("Composite.Combined", 3, "RGBA"), "a_1.exr")
+    assert (read_frame(open_source(folder), 0).frame.radiance == 1).all()
+    put(folder, planes("Combined", 4, "RGBA") | planes("Vector", 0, "XYZW"), "a_1.exr")  # a single layer without a name
+    assert (read_frame(open_source(folder), 0).frame.radiance == 4).all()
 
 
 def old_cycles(**without):
