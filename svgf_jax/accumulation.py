@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from svgf_jax.color import largest_luminance, luminance_of_planes
-from svgf_jax.sampling import STRIP_ROWS, in_strips, planes, stack_planes
+from svgf_jax.sampling import BY_WIDTH, in_strips, planes, stack_planes
 from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
 from svgf_jax.windows import window_range
 
@@ -93,7 +93,7 @@ def clamp_history(
     *,
     params: Params,
     config: Config,
-    strip_rows: int | None = STRIP_ROWS,
+    strip_rows: int | None = BY_WIDTH,
 ) -> Reprojected:
     """Clamp the history, channel by channel, to mean +- clamp_sigma standard deviations of this frame around each pixel.
 

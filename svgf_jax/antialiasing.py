@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array, lax
 
 from svgf_jax.check import check_image, check_taa
-from svgf_jax.sampling import STRIP_ROWS, in_strips, planes, read_at, square_offsets, sum_over_taps
+from svgf_jax.sampling import BY_WIDTH, in_strips, planes, read_at, square_offsets, sum_over_taps
 from svgf_jax.tonemapping import compress_luma, expand_luma
 from svgf_jax.types import Params, TaaHistory, at_level
 
@@ -36,7 +36,7 @@ def taa(
     depth: Array,
     *,
     params: Params = Params(),
-    strip_rows: int = STRIP_ROWS,
+    strip_rows: int = BY_WIDTH,
 ) -> tuple[TaaHistory, Array]:
     """Anti-alias one frame: (history, frame) -> (history, image).
 

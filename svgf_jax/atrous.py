@@ -7,7 +7,7 @@ from jax import Array, lax
 
 from svgf_jax.color import luminance_of_planes
 from svgf_jax.edges import Guides, depth_gradient, geometry_exponent, guides_of, luminance_scale
-from svgf_jax.sampling import STRIP_ROWS, planes, square_offsets, stack_planes, sum_over_taps
+from svgf_jax.sampling import BY_WIDTH, planes, square_offsets, stack_planes, sum_over_taps
 from svgf_jax.types import Config, Frame, Params, at_level
 
 _OFFSETS = square_offsets(2)
@@ -20,7 +20,7 @@ def atrous_filter(
     *,
     params: Params,
     config: Config,
-    strip_rows: int | None = STRIP_ROWS,
+    strip_rows: int | None = BY_WIDTH,
 ) -> tuple[Array, Array, Array]:
     """All levels, with step sizes 1, 2, 4, ...
 
@@ -77,7 +77,7 @@ def atrous_level(
     level: int,
     params: Params,
     prefilter: bool = True,
-    strip_rows: int | None = STRIP_ROWS,
+    strip_rows: int | None = BY_WIDTH,
 ) -> tuple[Array, Array]:
     """One level: C' = sum h w C / sum h w and V' = sum h^2 w^2 V / (sum h w)^2 over 5 x 5 taps 2**level apart (equations 1, 2).
 
@@ -182,7 +182,7 @@ def _normalise(total, color: tuple[Array, ...], variance: Array):
 
 
 def prefilter_variance(
-    variances: tuple[Array, ...], surface: Array, *, strip_rows: int | None = STRIP_ROWS
+    variances: tuple[Array, ...], surface: Array, *, strip_rows: int | None = BY_WIDTH
 ) -> tuple[Array, ...]:
     """g: the 3 x 3 Gaussian (1/4, 1/8, 1/16) of variance planes `[H, W]`, renormalised over the taps with a surface."""
     kernel = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25]).reshape(-1)

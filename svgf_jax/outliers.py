@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from svgf_jax.color import largest_luminance
-from svgf_jax.sampling import STRIP_ROWS, planes, stack_planes
+from svgf_jax.sampling import BY_WIDTH, planes, stack_planes
 from svgf_jax.types import Config, Frame, Params, SvgfError, at_level
 from svgf_jax.windows import window_range
 
@@ -16,7 +16,7 @@ def remove_outliers(
     *,
     params: Params,
     config: Config,
-    strip_rows: int | None = STRIP_ROWS,
+    strip_rows: int | None = BY_WIDTH,
 ) -> Array:
     """Clamp every pixel, channel by channel, to mean +- outlier_sigma standard deviations of its neighbours.
 
@@ -67,7 +67,7 @@ def clamp_outliers(image: Array, *, radius: int = 3, sigma: Array | float = 10.0
     counts = jnp.ones(image.shape[:2], bool) if mask is None else jnp.asarray(mask, bool)
     limit = largest_luminance(image.dtype)
     known = jnp.where(counts[..., None], jnp.nan_to_num(image, posinf=limit, neginf=-limit), 0.0)
-    clamped = jnp.stack(_clamp(planes(known), counts, radius=radius, sigma=sigma, strip_rows=STRIP_ROWS), axis=-1)
+    clamped = jnp.stack(_clamp(planes(known), counts, radius=radius, sigma=sigma, strip_rows=BY_WIDTH), axis=-1)
     return jnp.where(counts[..., None], clamped, image)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from svgf_jax.sampling import STRIP_ROWS, planes, read_at, square_offsets, stack_planes, strip_count
+from svgf_jax.sampling import BY_WIDTH, planes, read_at, split_rows, square_offsets, stack_planes
 from svgf_jax.types import Config, Frame, History, Params, Reprojected, at_level
 
 _LEAST_WEIGHT = 0.01  # of the consistent ones of the 2 x 2 taps, to be trusted
@@ -19,7 +19,7 @@ def reproject(
     *,
     params: Params,
     config: Config = Config(),
-    strip_rows: int | None = STRIP_ROWS,
+    strip_rows: int | None = BY_WIDTH,
 ) -> Reprojected:
     """Bring the history to this frame's pixels.
 
@@ -38,8 +38,7 @@ def reproject(
     """
     scalars = at_level(params, 0)
     height, width = frame.depth.shape
-    count = 1 if strip_rows is None else strip_count(height, strip_rows)
-    rows = -(-height // count)
+    count, rows = (1, height) if strip_rows is None else split_rows(height, width, strip_rows)
     guides = {"id": history.object_id, "depth": history.depth, "normal": planes(history.normal)}
     values = (tuple(map(planes, history.illumination)), tuple(map(planes, history.moments)), history.history_length)
     current = {

@@ -18,7 +18,9 @@ from jax import Array, lax
 Planes = Any  # a tree whose leaves are [H, W] arrays
 Sums = TypeVar("Sums")
 
-STRIP_ROWS = 36  # a strip's working set then stays near the size of a level-2 cache at 1920 pixels width
+BY_WIDTH = 0  # rows per strip: as many as have STRIP_PIXELS pixels
+STRIP_PIXELS = 8192  # the fastest of 4 to 64 thousand, at 480 and at 1920 pixels width: a strip's planes fit the level-2 cache
+UNROLL_FROM = 2**19  # pixels of an image whose taps are unrolled: half the time, for some seconds more of compilation
 
 
 def planes(image: Array) -> tuple[Array, ...]:
@@ -40,10 +42,20 @@ def shift(plane: Array, dy: int, dx: int) -> Array:
     return jnp.pad(inside, ((max(-dy, 0), max(dy, 0)), (max(-dx, 0), max(dx, 0))))
 
 
-def strip_count(height: int, strip_rows: int) -> int:
-    """How many strips of about `strip_rows` rows; never one: the compiler would dissolve that loop into its surroundings, and round
-    differently in a scan over frames than in a step by itself."""
-    return max(2, -(-height // strip_rows))
+def split_rows(height: int, width: int, strip_rows: int) -> tuple[int, int]:
+    """How many strips, and of how many rows, for strips of about `strip_rows` rows (`BY_WIDTH`: of about STRIP_PIXELS pixels).
+
+    Never one strip: the compiler would dissolve that loop into its surroundings, and round differently in a scan over frames than
+    in a step by itself.
+    """
+    wanted = strip_rows or max(1, STRIP_PIXELS // width)
+    count = max(2, -(-height // wanted))
+    return count, -(-height // count)
+
+
+def unroll_taps(height: int, width: int, taps: int) -> bool:
+    """Whether the loop over taps is unrolled: the sums then stay in registers, but each tap is compiled by itself."""
+    return height * width >= UNROLL_FROM and taps <= 25
 
 
 def square_offsets(radius: int, step_size: int = 1) -> np.ndarray:
@@ -64,7 +76,7 @@ def sum_over_taps(
     where: Array | None = None,
     step_size: int | Array = 1,
     largest_step: int = 1,
-    strip_rows: int | None = STRIP_ROWS,
+    strip_rows: int | None = BY_WIDTH,
 ) -> Planes:
     """Run a stencil: for every pixel p, add up what `tap` makes of each neighbour q, then `finish` the sums.
 
@@ -82,7 +94,7 @@ def sum_over_taps(
         where: `[H, W]` bool; a strip without a True is not computed and its result is 0. None = everywhere.
         step_size: pixels per step, an integer; may be traced (a loop over levels then compiles once) unless strip_rows is None.
         largest_step: the largest value step_size may take.
-        strip_rows: rows per strip; None = no strips and no loop, the plain form that the other is tested against.
+        strip_rows: rows per strip, `BY_WIDTH`; None = no strips and no loop, the plain form that the other is tested against.
 
     Returns:
         The tree that `finish` returns, with leaves `[H, W]`.
@@ -97,9 +109,9 @@ def sum_over_taps(
             totals = tap(totals, q, centre, jax.tree.map(lambda a, i=i: a[i], per_tap))
         return finish(totals, centre)
 
-    count = strip_count(height, strip_rows)
-    rows = -(-height // count)
+    count, rows = split_rows(height, width, strip_rows)
     below = count * rows - height
+    unroll = len(offsets) if unroll_taps(height, width, len(offsets)) else 1
     padded = jax.tree.map(lambda a: jnp.pad(a, ((top, top + below), (left, left))), neighbours)
     centred = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), (centre, where))
     corners = jnp.asarray(offsets) * jnp.asarray(step_size, jnp.int32) + jnp.array([[top, left]], jnp.int32)
@@ -110,7 +122,8 @@ def sum_over_taps(
             q = jax.tree.map(lambda a: lax.dynamic_slice(a, (corner[0], corner[1]), (rows, width)), window)
             return tap(totals, q, p, t), None
 
-        totals, _ = lax.scan(body, jax.tree.map(lambda s: jnp.full((rows, width), s), sums), (corners, per_tap))
+        start = jax.tree.map(lambda s: jnp.full((rows, width), s), sums)
+        totals, _ = lax.scan(body, start, (corners, per_tap), unroll=unroll)
         return finish(totals, p)
 
     def strip(first_row: Array) -> Planes:
@@ -130,20 +143,19 @@ def sum_over_taps(
     return jax.tree.map(lambda a: a.reshape(count * rows, width)[:height], result)
 
 
-def in_strips(function: Callable[..., Planes], *images: Planes, strip_rows: int = STRIP_ROWS) -> Planes:
+def in_strips(function: Callable[..., Planes], *images: Planes, strip_rows: int = BY_WIDTH) -> Planes:
     """Run pixel-wise arithmetic strip by strip: it stays in the cache, and is compiled, hence rounded, the same wherever it is.
 
     Args:
         function: trees of planes -> a tree of planes; every pixel by itself.
         images: trees of planes `[H, W]`.
-        strip_rows: rows per strip, about.
+        strip_rows: rows per strip, about, or `BY_WIDTH`.
 
     Returns:
         The tree that `function` returns, with leaves `[H, W]`.
     """
     height, width = jax.tree.leaves(images)[0].shape
-    count = strip_count(height, strip_rows)
-    rows = -(-height // count)
+    count, rows = split_rows(height, width, strip_rows)
     padded = jax.tree.map(lambda a: jnp.pad(a, ((0, count * rows - height), (0, 0))), images)
     split = jax.tree.map(lambda a: a.reshape(count, rows, width), padded)
     result = lax.map(lambda strips: function(*strips), split)

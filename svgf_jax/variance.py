@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from svgf_jax.edges import depth_gradient, geometry_exponent, guides_of
-from svgf_jax.sampling import STRIP_ROWS, in_strips, planes, square_offsets, sum_over_taps
+from svgf_jax.sampling import BY_WIDTH, in_strips, planes, square_offsets, sum_over_taps
 from svgf_jax.types import Config, Frame, Params, at_level
 
 SHORT_HISTORY = 4 - 1e-3  # history length is a real number: a mean of threes and fives must not be decided by rounding
@@ -23,7 +23,7 @@ def estimate_variance(
     *,
     params: Params,
     config: Config = Config(),
-    strip_rows: int | None = STRIP_ROWS,
+    strip_rows: int | None = BY_WIDTH,
 ) -> Array:
     """V = max(0, M2 - M1^2), temporal where history is long enough, else over 7 x 7 pixels.
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from svgf_jax.color import largest_luminance
-from svgf_jax.sampling import STRIP_ROWS, Planes, square_offsets, sum_over_taps
+from svgf_jax.sampling import BY_WIDTH, Planes, square_offsets, sum_over_taps
 
 
 def window_range(
@@ -15,7 +15,7 @@ def window_range(
     radius: int,
     sigma: Array | float,
     centre: bool = True,
-    strip_rows: int | None = STRIP_ROWS,
+    strip_rows: int | None = BY_WIDTH,
 ) -> tuple[Planes, Planes]:
     """mean - sigma * deviation and mean + sigma * deviation of each plane over (2 radius + 1)^2 pixels.
 
