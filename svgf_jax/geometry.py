@@ -104,7 +104,9 @@ def depth_by_planes(
     known = depth[y, x].astype(np.float64)
 
     def bend(values: np.ndarray) -> float:
-        spread = np.subtract(*np.nanpercentile(values, [75, 25]))
+        spread = max(
+            np.subtract(*np.nanpercentile(values, [75, 25])), 0.01 * abs(np.nanmedian(values))
+        )  # a frontal wall
         apart = np.abs((values[0] + values[2]) / 2 - values[1])
         return float(np.median(np.nan_to_num(apart / spread, nan=1.0, posinf=1.0)))
 

@@ -21,6 +21,7 @@ from svgf_jax.types import Config, Frame, Params
 from svgf_jax.warping import Residual, Step, Verdict, find_convention, warp_residual
 
 SIDE = 640  # pixels: of larger pictures, noise, normals, depth and motion are judged in the middle, so many pixels each way
+NOISY = 0.25  # noise relative to the light from which on it can be compared between frames
 
 
 class Broken(NamedTuple):
@@ -122,13 +123,11 @@ class _Read(NamedTuple):
 
 
 class _Noise(NamedTuple):
-    """What one frame's radiance says; `which` of its `lights` is the noisiest: hardly anything else is in that."""
+    """What one frame's radiance says; `where` noise can be judged; `lights` are the signals' luminances."""
 
     signals: tuple[Light, ...]
     psnr: float | None
-    correlation: float | None
     where: np.ndarray
-    which: int
     lights: np.ndarray
 
 
@@ -166,7 +165,9 @@ def inspect_source(source: Source, *, params: Params = Params(), config: Any = C
             for at, name in enumerate(source.roles.signals)
         },
         psnr=_mean(one.psnr for one in noises.values()),
-        correlation=_mean(one.correlation for one in noises.values()),
+        correlation=_mean(
+            _correlation(read[b], noises[b], *((read[a], noises[a]) if a != b else (None, None))) for a, b in pairs
+        ),
         repeated=_mean(_repeated(read[a], read[b], noises[a], noises[b]) for a, b in pairs if a != b),
         broken=_broken(source.roles, read.values()),
         background=float(np.mean([(np.asarray(one.loaded.frame.object_id) == -1).mean() for one in read.values()])),
@@ -237,22 +238,33 @@ def _noise(frame: Frame) -> _Noise:
     where, surface = noise.uniform(frame), np.asarray(frame.object_id) != -1
     lights = noise.illumination(frame)
     signals = tuple(Light(noise.relative_noise(light, where), noise.fireflies(light, surface)) for light in lights)
-    spreads = [noise.neighbours(light, frame) for light in lights]
-    which = max(range(len(spreads)), key=lambda at: spreads[at].spread)
-    return _Noise(
-        signals,
-        noise.expected_psnr(noise.beauty(frame), where, float(surface.mean())),
-        spreads[which].correlation,
-        where,
-        which,
-        lights,
-    )
+    return _Noise(signals, noise.expected_psnr(noise.beauty(frame), where, float(surface.mean())), where, lights)
+
+
+def _correlation(now: _Read, noise_now: _Noise, before: _Read | None, noise_before: _Noise | None) -> float | None:
+    """Of the signal with the most noise, by what changed since the frame before if there is one: texture is no noise."""
+    found = []
+    for at, light in enumerate(noise_now.lights):
+        if before is None or noise_before is None:
+            surface = np.asarray(now.frame.object_id) != -1
+            found.append(noise.neighbours(noise.bounded(light, surface), now.frame))
+        else:
+            changed = noise.change(light, noise_before.lights[at], now.frame, before.frame)
+            found.append(noise.neighbours(*changed))
+    return max(found, key=lambda one: one.spread).correlation
 
 
 def _repeated(before: _Read, now: _Read, noise_before: _Noise, noise_now: _Noise) -> float | None:
+    """Of the signal with the most noise for its light."""
+    which = int(np.argmax([one.noise or 0.0 for one in noise_now.signals]))
+    if (noise_now.signals[which].noise or 0.0) < NOISY:
+        return None
     same = np.asarray(before.frame.object_id) == np.asarray(now.frame.object_id)
     where = noise_before.where & noise_now.where & same
-    return noise.repeated_noise(noise_now.lights[noise_now.which], noise_before.lights[noise_now.which], where)
+    with np.errstate(all="ignore"):
+        moved = np.linalg.norm(now.frame.motion, axis=-1)
+        moving, still = where & (moved >= 1), where & (moved < 0.01)
+    return noise.repeated_noise(noise_now.lights[which], noise_before.lights[which], moving, still)
 
 
 def _broken(roles: Roles, read: Iterable[_Read]) -> dict[str, Broken]:

@@ -109,13 +109,30 @@ def bounded(light: np.ndarray, where: np.ndarray) -> np.ndarray:
     return np.divide(light, light + spread, out=np.zeros(light.shape), where=(spread > 0) & where)
 
 
-def neighbours(light: np.ndarray, frame: Frame) -> Neighbours:
-    """How much pixels of `light` `[H, W]` on the same surface differ, and how little less the nearest do: medians over blocks.
+def change(light: np.ndarray, before: np.ndarray, frame: Frame, frame_before: Frame) -> tuple[np.ndarray, Frame]:
+    """Bounded `light` less that of the frame before where the motion leads (nearest pixel), over the root of 2: noise, no texture.
 
-    The correlation is 1 - D(1) / D(3), with D(n) the mean square difference over n pixels, into which light that changes
-    slowly hardly enters. None where less than half of the blocks have noise.
+    Also the frame, without a surface where it leads out of the picture.
     """
-    values = bounded(light, np.asarray(frame.object_id) != -1)
+    height, width = light.shape
+    with np.errstate(all="ignore"):
+        to = np.nan_to_num(np.asarray(frame.motion, np.float64), nan=1e9).clip(-1e9, 1e9) + np.indices(light.shape)[
+            ::-1
+        ].transpose(1, 2, 0)
+        x, y = np.rint(to).astype(np.int64).transpose(2, 0, 1)
+    ids = np.asarray(frame.object_id)
+    known = (ids != -1) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    there = bounded(before, np.asarray(frame_before.object_id) != -1)[np.where(known, y, 0), np.where(known, x, 0)]
+    values = np.where(known, bounded(light, ids != -1) - there, 0) / np.sqrt(2)
+    return values, frame._replace(object_id=np.where(known, ids, -1))
+
+
+def neighbours(values: np.ndarray, frame: Frame) -> Neighbours:
+    """How much `values` `[H, W]` (of `change`, or `bounded`) differ on the same surface, and how little less the nearest do.
+
+    The correlation is 1 - D(1) / D(3), with D(n) the mean square difference over n pixels, into which what changes slowly
+    hardly enters; medians over blocks. None where less than half of the blocks have noise.
+    """
     near, far, pairs = 0.0, 0.0, 0.0
     for dx, dy in ((1, 0), (0, 1)):
         whole = alike(frame, dx, dy) & alike(frame, 2 * dx, 2 * dy) & alike(frame, 3 * dx, 3 * dy)
@@ -132,17 +149,18 @@ def neighbours(light: np.ndarray, frame: Frame) -> Neighbours:
     return Neighbours(float(np.median(spread)), correlation)
 
 
-def repeated_noise(light: np.ndarray, before: np.ndarray, where: np.ndarray) -> float | None:
-    """Correlation between the noise of a frame and that of the one before at the same pixels `where`.
+def repeated_noise(light: np.ndarray, before: np.ndarray, moving: np.ndarray, still: np.ndarray) -> float | None:
+    """How much of the noise of the frame before is there again at the same pixels: 1 for the same random numbers, else 0.
 
-    1 for the same random numbers in both. Meant for light that is mostly noise: the edges of what stands still repeat as well.
-    None where there is too little.
+    Of `moving` surfaces `[H, W]` (by a pixel or more) the correlation of what no plane explains; texture has moved on. Of
+    those that are `still`, if too few move, the share of equal values. None where there is too little noise or light.
     """
-    first, second = residual(bounded(light, where))[where], residual(bounded(before, where))[where]
-    scale = np.sqrt((first**2).sum() * (second**2).sum())
-    return (
-        float((first * second).sum() / scale) if where.sum() >= 4 * LEAST and scale > STILL**2 * where.sum() else None
-    )
+    if moving.sum() >= 4 * LEAST:
+        first, second = residual(bounded(light, moving))[moving], residual(bounded(before, moving))[moving]
+        scale = np.sqrt((first**2).sum() * (second**2).sum())
+        return float((first * second).sum() / scale) if scale > STILL**2 * moving.sum() else None
+    lit = still & (light > 0)
+    return _share((light == before)[lit].sum(), lit.sum()) if lit.sum() >= 4 * LEAST else None
 
 
 def fireflies(light: np.ndarray, surface: np.ndarray, *, radius: int = 3, sigma: float = 10.0) -> Fireflies:

@@ -95,6 +95,11 @@ def test_a_depth_that_is_neither_fits_nothing(planes):
     assert geometry.depth_by_planes(rough, frame_of(planes), camera=None).best == ()
 
 
+def test_a_frontal_wall_is_flat():
+    wall = frame_of(room(0))._replace(object_id=np.zeros(SIZE, np.int32), normal=np.full((*SIZE, 3), [0, 0, -1.0]))
+    assert VIEW_Z in geometry.depth_by_planes(np.full(SIZE, 3.0), wall, camera=None).best
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_history_is_found_where_the_filter_finds_it(seed):
     scene = scenes.synthetic(seed, 24, 32, frames=2)

@@ -112,6 +112,7 @@ CASES = {
         "same in every frame",
         "clock",
     ),
+    "one seed, still": ({"seed": 5, "speed": 0}, {}, "seed", "same in every frame", "seed"),
     "denoised already": ({"change": smooth}, {}, "noise", "denoised already", "noisy picture"),
     "broken light": ({"change": spoil}, {}, "broken radiance", "3 NaN and 3 infinite", "set to 0"),
     "negative light": ({"change": spoil}, {}, "negative radiance", "3 negative", "Lanczos"),

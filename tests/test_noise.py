@@ -51,7 +51,10 @@ def test_without_light_nothing_is_said(frame):
     assert noise.relative_noise(white(), np.zeros(SIZE, bool)) is None
     assert noise.neighbours(np.ones(SIZE), frame) == (0, None)
     assert noise.neighbours(white(), frame._replace(object_id=np.full(SIZE, -1))) == (0, None)
-    assert noise.repeated_noise(np.ones(SIZE), np.ones(SIZE), noise.uniform(frame)) is None
+    where, none = noise.uniform(frame), np.zeros(SIZE, bool)
+    assert noise.repeated_noise(np.ones(SIZE), np.ones(SIZE), where, none) is None
+    assert noise.repeated_noise(np.zeros(SIZE), np.zeros(SIZE), none, where) is None
+    assert noise.repeated_noise(white(), white(), none, none) is None
     assert noise.expected_psnr(np.ones((*SIZE, 3)), np.zeros(SIZE, bool), 0.0) is None
     assert noise.fireflies(np.zeros(SIZE), np.zeros(SIZE, bool)) == (0, 0)
 
@@ -67,21 +70,45 @@ def test_the_psnr_is_that_against_the_noise_free_picture(frame):
 def test_neighbours_are_correlated_as_the_filter_makes_them(frame, sigma, least, most):
     """Of a Gaussian filter of standard deviation s, neighbours have exp(-1 / 4 s^2): 0.37 and 0.78."""
     light = white() if sigma is None else blurred(white(), sigma)
+    surface = np.asarray(frame.object_id) != -1
     slope = 1 + 0.3 * np.sin(0.1 * np.arange(SIZE[1]))
-    assert least < noise.neighbours(light * slope, frame).correlation < most
+    assert least < noise.neighbours(noise.bounded(light * slope, surface), frame).correlation < most
 
 
 def test_one_firefly_does_not_decide_the_correlation(frame):
     light = white()
     light[30, 40:42] = 1e5
-    assert abs(noise.neighbours(light, frame).correlation) < 0.05
+    values = noise.bounded(light, np.asarray(frame.object_id) != -1)
+    assert abs(noise.neighbours(values, frame).correlation) < 0.05
+
+
+@pytest.mark.parametrize("filtered", [None, 0.6])
+def test_texture_is_no_correlated_noise(filtered):
+    """Frames of a strong texture with little noise, which moves as the motion says."""
+    before, now = frame_of(room(2)), frame_of(room(3))
+    lights = []
+    for number in (2, 3):
+        position, noisy = room(number)["position"], white(0.25, seed=number)
+        texture = np.prod(2 + np.sin(9 * position), -1)
+        lights.append(texture * (noisy if filtered is None else blurred(noisy, filtered)))
+    plain = noise.neighbours(noise.bounded(lights[1], np.asarray(now.object_id) != -1), now).correlation
+    changed = noise.neighbours(*noise.change(lights[1], lights[0], now, before)).correlation
+    assert plain > 0.3
+    assert -0.05 < changed < 0.12 if filtered is None else changed > 0.3
 
 
 def test_noise_of_one_seed_is_recognised(frame):
-    where = noise.uniform(frame)
-    assert noise.repeated_noise(white(seed=1), white(seed=2), where) == pytest.approx(0, abs=0.08)
-    assert noise.repeated_noise(white(seed=1), white(seed=1), where) == pytest.approx(1)
-    assert noise.repeated_noise(white(seed=1), 0.5 * white(seed=1) + 0.5 * white(seed=2), where) > 0.4
+    where, none = noise.uniform(frame), np.zeros(SIZE, bool)
+    assert noise.repeated_noise(white(seed=1), white(seed=2), where, none) == pytest.approx(0, abs=0.08)
+    assert noise.repeated_noise(white(seed=1), white(seed=1), where, none) == pytest.approx(1)
+    assert noise.repeated_noise(white(seed=1), 0.5 * white(seed=1) + 0.5 * white(seed=2), where, none) > 0.4
+
+
+def test_of_what_stands_still_only_equal_values_count(frame):
+    where, none = noise.uniform(frame), np.zeros(SIZE, bool)
+    texture = 2 + np.sin(np.arange(SIZE[1]) * 2.0) * np.ones(SIZE)
+    assert noise.repeated_noise(white(0.1, seed=1) * texture, white(0.1, seed=2) * texture, none, where) == 0
+    assert noise.repeated_noise(white(seed=1), white(seed=1), none, where) == 1
 
 
 def test_fireflies_are_counted_with_their_light():
