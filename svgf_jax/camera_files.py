@@ -81,7 +81,7 @@ def cameras_of_headers(sequence: Sequence) -> Cameras | None:
             raise SvgfError(f"{path}: no worldToCamera and worldToNDC in the header, as the frames before have.")
         left, top, right, bottom = header.display_window
         frames[number] = _of_pbrt(to_camera.astype(float), to_ndc.astype(float), right - left + 1, bottom - top + 1)
-    return Cameras(sequence.name, frames, None) if frames else None
+    return Cameras(sequence.name, frames, None, sequence.files) if frames else None
 
 
 def _of_pbrt(to_camera: np.ndarray, to_ndc: np.ndarray, width: int, height: int) -> Camera:

@@ -262,7 +262,8 @@ def _identity(source: frames.Source, options: WriteOptions, provenance: Mapping[
         "version": __version__,
         "attributes": {name: provenance[name] for name in ("svgf_jax:preset", "svgf_jax:source")},
         "options": options._asdict(),
-        "roles": {role: list(layer.channels) for role, layer in source.roles.layers.items()},
+        "roles": {role: [*layer.channels, layer.meaning] for role, layer in source.roles.layers.items()},
+        "signals": list(source.roles.signals),
         "cameras": None if source.cameras is None or source.cameras.files else stamp(source.cameras.path),
         "missing": source.sequence.missing,
     }

@@ -119,6 +119,7 @@ def test_pbrt_has_its_camera_in_the_header(tmp_path, coordinates, shape):
         put(tmp_path, channels, f"p_{number:02d}.exr", attributes=header)
     source = open_source(tmp_path, position=True)
     assert (source.table.name, source.warnings) == ("pbrt", ())
+    assert source.cameras.files == source.sequence.files  # what a run that is resumed looks at
     item = read_frame(source, 1)
     assert item.notes == ()
     frame = item.frame
