@@ -1,9 +1,12 @@
 """What a run keeps in its output folder so that it can be resumed: a lock, its identity, the history. No JAX.
 
-All of it lies in `OUT/.svgf-jax/`: `lock` (held by the operating system for as long as the process lives), `run.json`
-(what is being computed: parameters, inputs, options), `checkpoint.npz` (the history after so many frames) and
-`frames.jsonl` (a line for each frame that was done: its time, repairs, mean history length). The first three are
-replaced atomically, the last grows. They carry data only; nothing in them is ever executed.
+All of it lies in the *state folder* `OUT/.svgf-jax/`: `lock` (held by the operating system for as long as the process
+lives), `run.json` (what is being computed: parameters, inputs, options), `checkpoint.npz` (the history after so many
+frames) and `frames.jsonl` (a line for each frame that was done: its time, repairs, mean history length). The first three
+are replaced atomically, the last grows. They carry data only; nothing in them is ever executed.
+
+Several parts of one sequence may be written into one folder at a time: each has a state folder of its own in that one,
+`OUT/.svgf-jax/101-200/`.
 """
 
 import contextlib
@@ -36,42 +39,60 @@ class Checkpoint(NamedTuple):
     history: History | None
 
 
-@contextmanager
-def lock(out: Path) -> Iterator[None]:
-    """Hold `out`, creating it and its state folder, so that no second run writes there; `SvgfError` if one does.
+def state_folder(out: Path, part: str = "") -> Path:
+    """Where the state of a run into `out` is kept, or that of one part of it, called `101-200`."""
+    return out / FOLDER / part
 
-    The lock dies with its process, however that ends. Where the file system has no locks, it is silently no protection.
+
+@contextmanager
+def lock(state: Path) -> Iterator[None]:
+    """Hold a state folder, creating it, so that no second run writes there; `SvgfError` if one does.
+
+    Parts keep a run of the whole out, and it them, but not each other. The lock dies with its process, however that ends.
+    Where the file system has no locks, it is silently no protection.
     """
-    try:
-        (out / FOLDER).mkdir(parents=True, exist_ok=True)
-        file = open(out / FOLDER / "lock", "a+")  # noqa: SIM115 (closed below; open for as long as the lock is held)
-    except OSError as error:
-        raise SvgfError(
-            f"Cannot write into the output folder {out}: {error.strerror or error}. "
-            "Wanted a folder that is writable or can be created; try another one."
-        ) from error
-    with file:
-        if not _try_lock(file):
-            file.seek(0)
-            raise SvgfError(
-                f"Another run is writing into {out} ({file.read().strip() or 'unknown process'}). "
-                "Wait for it to end, or choose another output folder."
-            )
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-        file.flush()
+    with _held(state.parent, shared=True) if state.name != FOLDER else contextlib.nullcontext(), _held(state):
         yield
 
 
-def save_run(out: Path, identity: Identity, *, complete: bool) -> None:
-    """Record what is being computed into `out`, and whether it is all there."""
+@contextmanager
+def _held(state: Path, *, shared: bool = False) -> Iterator[None]:
+    try:
+        state.mkdir(parents=True, exist_ok=True)
+        file = open(state / "lock", "a+")  # noqa: SIM115 (closed below; open for as long as the lock is held)
+    except OSError as error:
+        raise SvgfError(
+            f"Cannot write into the output folder {_folder(state)}: {error.strerror or error}. "
+            "Wanted a folder that is writable or can be created; try another one."
+        ) from error
+    with file:
+        if not _try_lock(file, shared=shared):
+            file.seek(0)
+            raise SvgfError(
+                f"Another run is writing into {_folder(state)} ({file.read().strip() or 'parts of the sequence'}). "
+                "Wait for it to end, or choose another output folder."
+            )
+        file.truncate(0)
+        if not shared:
+            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+            file.flush()
+        yield
+
+
+def _folder(state: Path) -> str:
+    """The output folder of a state folder, for people."""
+    return str(state.parent) if state.name == FOLDER else f"{state.parent.parent} (frames {state.name})"
+
+
+def save_run(state: Path, identity: Identity, *, complete: bool) -> None:
+    """Record what is being computed, and whether it is all there."""
     text = json.dumps({"format": FORMAT, "complete": complete, "identity": identity}, indent=1)
-    _replace(out / FOLDER / "run.json", lambda file: file.write(text.encode()))
+    _replace(state / "run.json", lambda file: file.write(text.encode()))
 
 
-def load_run(out: Path) -> tuple[Identity, bool] | None:
-    """(identity, complete) of the run recorded in `out`; None if there is no record."""
-    path = out / FOLDER / "run.json"
+def load_run(state: Path) -> tuple[Identity, bool] | None:
+    """(identity, complete) of the run recorded in `state`; None if there is no record."""
+    path = state / "run.json"
     try:
         record = json.loads(path.read_text())
         if record["format"] != FORMAT or not isinstance(record["identity"]["frames"], list):
@@ -83,8 +104,8 @@ def load_run(out: Path) -> tuple[Identity, bool] | None:
         raise _unusable(path, error) from error
 
 
-def save_checkpoint(out: Path, identity: Identity, checkpoint: Checkpoint) -> None:
-    """Replace the checkpoint in `out`. Only to be called when every output before `next_index` is on disk."""
+def save_checkpoint(state: Path, identity: Identity, checkpoint: Checkpoint) -> None:
+    """Replace the checkpoint. Only to be called when every output before `next_index` is on disk."""
     arrays = {} if checkpoint.history is None else _flat(checkpoint.history)
     entries = {
         **{name: np.asarray(array) for name, array in arrays.items()},
@@ -92,15 +113,15 @@ def save_checkpoint(out: Path, identity: Identity, checkpoint: Checkpoint) -> No
         "next_index": np.asarray(checkpoint.next_index),
         "identity": np.frombuffer(json.dumps(identity).encode(), np.uint8),
     }
-    _replace(out / FOLDER / "checkpoint.npz", lambda file: np.savez(file, **entries))
+    _replace(state / "checkpoint.npz", lambda file: np.savez(file, **entries))
 
 
-def load_checkpoint(out: Path, identity: Identity) -> Checkpoint | None:
-    """The checkpoint in `out`, None if there is none; `SvgfError` if it is damaged or belongs to another computation.
+def load_checkpoint(state: Path, identity: Identity) -> Checkpoint | None:
+    """The checkpoint, None if there is none; `SvgfError` if it is damaged or belongs to another computation.
 
     The inputs still to come may differ from what they were (a frame repaired, frames added); those used may not.
     """
-    path = out / FOLDER / "checkpoint.npz"
+    path = state / "checkpoint.npz"
     try:
         with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             entries = {name: file[name] for name in file.files}
@@ -115,7 +136,7 @@ def load_checkpoint(out: Path, identity: Identity) -> Checkpoint | None:
         return None
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise _unusable(path, error) from error
-    check_same(out, saved, identity, used=next_index)
+    check_same(state, saved, identity, used=next_index)
     return Checkpoint(next_index, history)
 
 
@@ -135,9 +156,9 @@ def _unflat(entries: dict[str, Any]) -> History | None:
     return History(**arrays, taa=TaaHistory(**taa) if taa else None) if arrays else None
 
 
-def check_same(out: Path, saved: Identity, identity: Identity, *, used: int) -> None:
+def check_same(state: Path, saved: Identity, identity: Identity, *, used: int) -> None:
     """Raise `SvgfError` naming the first difference between two identities, over the first `used` frames."""
-    head = f"Cannot resume the run in {out}: "
+    head = f"Cannot resume the run in {_folder(state)}: "
     tail = " Run it as it was begun, or start again with --overwrite (or into another folder)."
     for index in range(used):
         then, now = saved["frames"][index], (identity["frames"][index : index + 1] or [None])[0]
@@ -147,9 +168,9 @@ def check_same(out: Path, saved: Identity, identity: Identity, *, used: int) -> 
         raise SvgfError(f"{head}{key} was {then}, and is {now} now.{tail}")
 
 
-def append_figures(out: Path, figures: Mapping[str, Any]) -> None:
+def append_figures(state: Path, figures: Mapping[str, Any]) -> None:
     """Note what is known of one frame that is done; its "number" says which. Raises SvgfError."""
-    path = out / FOLDER / "frames.jsonl"
+    path = state / "frames.jsonl"
     try:
         with path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(dict(figures), default=str) + "\n")
@@ -157,25 +178,25 @@ def append_figures(out: Path, figures: Mapping[str, Any]) -> None:
         raise SvgfError(f"Could not write {path}: {error}. Check that the disk is not full.") from error
 
 
-def load_figures(out: Path) -> dict[int, dict[str, Any]]:
+def load_figures(state: Path) -> dict[int, dict[str, Any]]:
     """What is known of the frames by number, the latest of each; a line that is cut off or damaged counts for nothing."""
     found: dict[int, dict[str, Any]] = {}
     with contextlib.suppress(OSError, UnicodeDecodeError):
-        for line in (out / FOLDER / "frames.jsonl").read_text(encoding="utf-8").splitlines():
+        for line in (state / "frames.jsonl").read_text(encoding="utf-8").splitlines():
             with contextlib.suppress(ValueError, KeyError, TypeError):
                 figures = json.loads(line)
                 found[int(figures["number"])] = figures
     return found
 
 
-def remove_figures(out: Path) -> None:
+def remove_figures(state: Path) -> None:
     """Forget them: another run begins."""
-    (out / FOLDER / "frames.jsonl").unlink(missing_ok=True)
+    (state / "frames.jsonl").unlink(missing_ok=True)
 
 
-def remove_checkpoint(out: Path) -> None:
+def remove_checkpoint(state: Path) -> None:
     """Forget the history; the record in run.json stays."""
-    (out / FOLDER / "checkpoint.npz").unlink(missing_ok=True)
+    (state / "checkpoint.npz").unlink(missing_ok=True)
 
 
 def _differences(saved: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
@@ -204,14 +225,14 @@ def _replace(path: Path, write: Callable[[BinaryIO], Any]) -> None:
         raise SvgfError(f"Could not write {path}: {error}. Check that the disk is not full.") from error
 
 
-def _try_lock(file: Any) -> bool:
-    """Take an exclusive lock on an open file without waiting: whether it was free."""
+def _try_lock(file: Any, *, shared: bool) -> bool:
+    """Take a lock on an open file without waiting: whether it was free. Shared ones go together."""
     try:
         import fcntl
     except ImportError:  # Windows: its file locks would also keep others from reading who holds it
         return True
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:  # a file system without locks

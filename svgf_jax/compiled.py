@@ -76,8 +76,11 @@ def _device(name: str | None) -> Any:
         ) from error
 
 
-def to_host(output: Output, name: str) -> Output:
-    """`output` as NumPy arrays; waits for them. `name` says whose it is if the device's memory ran out (SvgfError)."""
+def to_host(output: Any, name: str) -> Any:
+    """An output, or some of its arrays, as NumPy arrays; waits for them.
+
+    `name` says whose it is if the device's memory ran out (SvgfError).
+    """
     import jax
 
     try:

@@ -91,6 +91,7 @@ def open_source(
     *,
     frames: str | None = None,
     missing: Missing = "error",
+    warmup: int | None = None,
     channel: Mapping[str, Iterable[str]] | None = None,
     file: Mapping[str, PathName] | None = None,
     cameras: PathName | None = "auto",
@@ -106,6 +107,7 @@ def open_source(
         pattern: a folder, a pattern such as `frame_####.exr`, or one file.
         frames: a range such as `1-100`, `1-100x2`; all that are there if None.
         missing: what to do about missing frames: "error", "hold" or "reset".
+        warmup: also so many frames before them, to fill the history (see `find_sequence`).
         channel: role -> channel names, where they are not the native ones (see `svgf_jax.roles`).
         file: role -> pattern of files that hold this role.
         cameras: a cameras.json, or GAMES202's `matrix_#.mat`; "auto" takes those beside the frames if there are any,
@@ -122,7 +124,7 @@ def open_source(
     """
     table = None if renderer == "auto" else renderers.load_table(renderer)
     meaning = {} if motion is None else {"motion": str(parse_convention(motion))}
-    sequence = _find_frames(pattern, table, frames=frames, missing=missing)
+    sequence = _find_frames(pattern, table, frames=frames, missing=missing, warmup=warmup)
     at, path = next((i, path) for i, (_, path) in enumerate(sequence.files) if path is not None)
     header = exr.read_header(path)
     there = patterns(os.path.dirname(path))
@@ -379,7 +381,7 @@ def _meaning(roles: Roles, role: str) -> list[str]:
     return roles.layers[role].meaning.split() if role in roles.layers else []
 
 
-def _find_frames(pattern: PathName, table: renderers.Table | None, *, frames: str | None, missing: Missing) -> Sequence:
+def _find_frames(pattern: PathName, table: renderers.Table | None, **options: Any) -> Sequence:
     """The frames; in a folder of a renderer's files, those with the radiance."""
     text = os.fspath(pattern)
     if os.path.isdir(text):
@@ -387,7 +389,7 @@ def _find_frames(pattern: PathName, table: renderers.Table | None, *, frames: st
         table = table or renderers.detect_renderer((), (), tuple(there))
         main = renderers.find_file("radiance", table.main, there, where=text)
         text = main or text
-    return find_sequence(text, frames=frames, missing=missing)
+    return find_sequence(text, **options)
 
 
 def _read(path: str, source: Source) -> exr.Image:

@@ -19,10 +19,14 @@ class Plan(NamedTuple):
     Attributes:
         out: the output folder.
         files: (frame number, input file or None if missing), in order.
-        outputs: for each the EXR to write, under the input's name; None for a missing frame that is not held.
+        outputs: for each the EXR to write, under the input's name; None for a missing frame that is not held, and for those
+            that only warm up.
         png: whether each EXR has a PNG beside it.
         video: the video to write, if any.
         identity: what the run computes, to recognise it by when it is resumed.
+        hold: whether the history is kept across a missing frame.
+        warmup: how many of the first frames are filtered for the sake of the history only.
+        state: where the run's state is kept (see `svgf_jax.checkpoint`).
     """
 
     out: Path
@@ -31,13 +35,25 @@ class Plan(NamedTuple):
     png: bool
     video: Path | None
     identity: Identity
+    hold: bool
+    warmup: int
+    state: Path
 
 
 def make_plan(
-    files: Files, out: Path, *, hold: bool, png: bool, video: bool, identity: Identity, others: Sequence[Files] = ()
+    files: Files,
+    out: Path,
+    *,
+    hold: bool,
+    png: bool,
+    video: bool,
+    identity: Identity,
+    others: Sequence[Files] = (),
+    warmup: int | None = None,
 ) -> Plan:
     """Name the outputs. `hold`: missing frames get one too. `others`: further files of the same frames.
 
+    `warmup`: so many of the first files get no output, and the run is a part of a larger one; None: it is the whole.
     `identity` is all of what the run computes but its input frames, which are added here.
 
     Raises SvgfError: `out` is a file or names one, an output would be an input, nothing there to hold.
@@ -47,24 +63,33 @@ def make_plan(
             f"Got {out} as the output; wanted a folder, for example {out.parent / 'denoised'}. "
             "The files in it get the names of the inputs."
         )
-    if hold and files and files[0][1] is None:
+    before, part = warmup or 0, part_name(files, warmup)
+    if hold and files and files[before][1] is None:
         raise SvgfError(
-            f"Frame {files[0][0]} is missing, and there is none before it whose output could be held. "
+            f"Frame {files[before][0]} is missing, and there is none before it whose output could be held. "
             "Begin with a frame that is there (--frames), or use --missing reset."
         )
-    planned = output_paths(files, out, hold=hold)
+    planned = output_paths(files, out, hold=hold, warmup=before)
     inputs = {os.path.realpath(path) for _, path in files if path is not None}
     for path in planned:
         if path is not None and os.path.realpath(path) in inputs:
             raise SvgfError(f"The output {path} would replace an input. Choose another output folder.")
-    film = out / (_stem(next((path.name for path in planned if path), "")) + ".mp4") if video else None
+    stem = _stem(next((path.name for path in planned if path), ""))
+    film = out / f"{stem}{f'.{part}' if part else ''}.mp4" if video else None
     stamps = [[files[i][0], *(stamp(sequence[i][1]) for sequence in (files, *others))] for i in range(len(files))]
-    return Plan(out, files, planned, png, film, identity | {"frames": stamps})
+    state = checkpoint.state_folder(out, part)
+    return Plan(out, files, planned, png, film, identity | {"frames": stamps}, hold, before, state)
 
 
-def output_paths(files: Files, out: Path, *, hold: bool) -> tuple[Path | None, ...]:
-    """The file that each frame of a run is written to; None for a missing one that is not held."""
-    return tuple(None if name is None else out / name for name in _output_names(files, hold=hold))
+def output_paths(files: Files, out: Path, *, hold: bool, warmup: int = 0) -> tuple[Path | None, ...]:
+    """The file that each frame of a run is written to; None for a missing one that is not held, and for the first `warmup`."""
+    names = [None] * warmup + _output_names(files, hold=hold)[warmup:]
+    return tuple(None if name is None else out / name for name in names)
+
+
+def part_name(files: Files, warmup: int | None) -> str:
+    """`101-200`: what the part of a sequence is called of which the first `warmup` files only warm up; "" for None, the whole."""
+    return "" if warmup is None else f"{files[warmup][0]}-{files[-1][0]}"
 
 
 def begin(plan: Plan, *, resume: bool, overwrite: bool) -> Checkpoint | None:
@@ -75,10 +100,10 @@ def begin(plan: Plan, *, resume: bool, overwrite: bool) -> Checkpoint | None:
     start = find_start(plan, resume=resume, overwrite=overwrite)
     if start is not None:
         if start.next_index == 0:
-            checkpoint.remove_checkpoint(plan.out)
-            checkpoint.remove_figures(plan.out)
+            checkpoint.remove_checkpoint(plan.state)
+            checkpoint.remove_figures(plan.state)
         _remove_temporary(plan)
-        checkpoint.save_run(plan.out, plan.identity, complete=False)
+        checkpoint.save_run(plan.state, plan.identity, complete=False)
     return start
 
 
@@ -126,7 +151,7 @@ def stamp(path: str | None) -> list | None:
 def _start(plan: Plan, *, overwrite: bool) -> Checkpoint:
     there = [path for path in written(plan) if path.exists()]
     if there and not overwrite:
-        record = checkpoint.load_run(plan.out)
+        record = checkpoint.load_run(plan.state)
         hint = "--resume continues the unfinished run, " if record is not None and not record[1] else ""
         raise SvgfError(
             f"{_list(there)} in {plan.out} exist{'s' if len(there) == 1 else ''} already, and nothing is overwritten "
@@ -136,12 +161,12 @@ def _start(plan: Plan, *, overwrite: bool) -> Checkpoint:
 
 
 def _resume(plan: Plan) -> Checkpoint | None:
-    record = checkpoint.load_run(plan.out)
+    record = checkpoint.load_run(plan.state)
     if record is None:  # never begun: a farm's script may always say resume
         return _start(plan, overwrite=False)
     saved, complete = record
     if complete:
-        checkpoint.check_same(plan.out, saved, plan.identity, used=len(saved["frames"]))
+        checkpoint.check_same(plan.state, saved, plan.identity, used=len(saved["frames"]))
         if len(saved["frames"]) != len(plan.files):
             raise SvgfError(
                 f"The run in {plan.out} is complete with {len(saved['frames'])} frames; the input has now "
@@ -149,9 +174,9 @@ def _resume(plan: Plan) -> Checkpoint | None:
             )
         _check_there(plan, None)
         return None
-    start = checkpoint.load_checkpoint(plan.out, plan.identity)
+    start = checkpoint.load_checkpoint(plan.state, plan.identity)
     if start is None:
-        checkpoint.check_same(plan.out, saved, plan.identity, used=0)
+        checkpoint.check_same(plan.state, saved, plan.identity, used=0)
         return Checkpoint(0, None)
     _check_there(plan, start.next_index)
     return start

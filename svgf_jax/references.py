@@ -55,7 +55,7 @@ def pair_references(
     """
     wanted = find_sequence(pattern, missing="reset", prefer=prefer)
     there = {number: path for number, path in wanted.files if path is not None}
-    numbers = [number for number, _ in frames.files]
+    numbers = [number for number, _ in frames.files[frames.warmup or 0 :]]
     paths = {number: there[number] for number in numbers if number in there}
     if not paths:
         raise SvgfError(

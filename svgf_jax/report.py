@@ -20,7 +20,7 @@ from svgf_jax.ablation import Measured
 from svgf_jax.comparison import Pair
 from svgf_jax.outputs import WriteOptions, beauty, numbers
 from svgf_jax.page import Line, Shown
-from svgf_jax.plan import output_paths
+from svgf_jax.plan import output_paths, part_name
 from svgf_jax.references import read_radiance, read_reference
 from svgf_jax.sequences import format_range
 from svgf_jax.shown import MOST, diagnostic_layers, diagnostics, encoded, legends, longest_history, share, shown_frame
@@ -56,7 +56,8 @@ class Run(NamedTuple):
 
 def watch(run: Run) -> Callable[[frames.LoadedFrame, Output], None]:
     """What `streaming.run(on_output=...)` takes: it keeps the maps of the frames that may be shown."""
-    chosen = page.evenly([number for number, path in run.source.sequence.files if path is not None], MOST)
+    before = run.source.sequence.warmup or 0
+    chosen = page.evenly([number for number, path in run.source.sequence.files[before:] if path is not None], MOST)
 
     def on_output(item: frames.LoadedFrame, output: Output) -> None:
         if item.number in chosen:
@@ -73,8 +74,9 @@ def run_page(run: Run, summary: Summary, *, repairs: Callable[[Mapping[str, int]
     `repairs` tells in words what the counts of repaired pixels mean.
     """
     sequence = run.source.sequence
-    paths = output_paths(sequence.files, run.out, hold=sequence.missing == "hold")
-    figures = checkpoint.load_figures(run.out)
+    warmup = sequence.warmup or 0
+    paths = output_paths(sequence.files, run.out, hold=sequence.missing == "hold", warmup=warmup)
+    figures = checkpoint.load_figures(checkpoint.state_folder(run.out, part_name(sequence.files, sequence.warmup)))
     done = [
         (index, number, path)
         for index, ((number, _), path) in enumerate(zip(sequence.files, paths, strict=True))
@@ -93,7 +95,8 @@ def run_page(run: Run, summary: Summary, *, repairs: Callable[[Mapping[str, int]
         page.plot([Line("pixels", x, repaired)], title="pixels repaired", frames=x),
         page.plot([Line("frames", x, length)], title="mean history length, frames", frames=x),
     ]
-    notes = [f"Interrupted: {len(done)} of {len(sequence.files)} frames are done."] if summary.interrupted else []
+    wanted = len(sequence.files) - warmup
+    notes = [f"Interrupted: {len(done)} of {wanted} frames are done."] if summary.interrupted else []
     notes += [*run.source.warnings, *summary.notes, *repairs(sum((Counter(one) for one in counts if one), Counter()))]
     if unknown := [number for number, one in zip(x, known, strict=True) if not one]:
         notes.append(
@@ -109,9 +112,10 @@ def run_page(run: Run, summary: Summary, *, repairs: Callable[[Mapping[str, int]
         for number, one, score, times, count, mean in zip(x, known, scores, seconds, repaired, length, strict=True)
     ]
     heads = ("frame", "status", "PSNR dB", "temporal error", "seconds", "repaired", "mean history")
+    after = f", after {warmup} to warm up" if warmup else ""
     before = f", {summary.resumed_at} of them by an earlier run" if summary.resumed_at else ""
     told = [
-        ("frames", f"{len(done)} of {len(sequence.files)}{before}"),
+        ("frames", f"{len(done)} of {wanted}{before}{after}"),
         ("device", summary.device or "nothing was left to compute"),
         ("seconds, this run", f"{summary.seconds:.1f}"),
         ("pictures", _pictures_of(shown, len(done))),

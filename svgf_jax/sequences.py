@@ -32,12 +32,15 @@ class Sequence(NamedTuple):
         name: the pattern, for people: `shot/frame_####.exr`, or the path of a single file.
         padding: least number of digits of the frame number; 0 for a file without a number.
         missing: what a missing frame means: "hold" keeps the history for the next frame, "reset" starts anew after it.
+        warmup: how many of the first files lie before the frames that are wanted, to fill the history; None: the frames are
+            not a part of a larger run.
     """
 
     files: tuple[tuple[int, str | None], ...]
     name: str
     padding: int
     missing: Missing
+    warmup: int | None = None
 
 
 def find_sequence(
@@ -45,26 +48,31 @@ def find_sequence(
     *,
     frames: str | None = None,
     missing: Missing = "error",
+    warmup: int | None = None,
     prefer: tuple[str, ...] = ("frame", "beauty"),
 ) -> Sequence:
     """The sequence that a pattern, a folder or a single file stands for.
 
     In a folder that holds several sequences the first that is called as in `prefer` is taken (`frame_0001.exr` is
     called frame); a folder without EXR files stands for the folder `input` in it. Without `frames` every frame between
-    the first and the last on the disk is wanted. Raises SvgfError: nothing there, an unclear folder, a range that
-    cannot be read, missing frames under "error".
+    the first and the last on the disk is wanted. `warmup`: also up to so many frames before them, at their distance, as far
+    as the first on the disk; a file with a number is then one frame of its sequence. Raises SvgfError: nothing there, an
+    unclear folder, a range that cannot be read, missing frames under "error".
     """
     if missing not in get_args(Missing):
         raise SvgfError(f"missing={missing!r} is not known; choose one of {', '.join(get_args(Missing))}.")
     text = os.fspath(pattern)
     wanted = None if frames is None else parse_range(frames)
+    if warmup is not None and warmup < 0:
+        raise SvgfError(f"warmup = {warmup}; wanted a number of frames, 0 or more.")
     if os.path.isdir(text):
         inside = os.path.join(text, "input")
         text = _pick(text if _patterns(text) or not _patterns(inside) else inside, prefer)
     if os.path.isfile(text):
         number = re.search(r"(\d+)(?!.*\d)", os.path.basename(text))
-        if wanted is None or number is None:
-            return _single(text, number, wanted, missing)
+        if number is None or (wanted is None and not warmup):
+            return _single(text, number, wanted, missing)._replace(warmup=None if warmup is None else 0)
+        wanted = wanted or [int(number[0])]
         start = len(text) - len(os.path.basename(text))
         text = text[: start + number.start()] + "#" * len(number[0]) + text[start + number.end() :]
     found, padding = _match(text)
@@ -72,6 +80,8 @@ def find_sequence(
         raise SvgfError(f"{text}: no such {'frames' if padding else 'file or folder'}. {_near(text)}")
     if wanted is None:
         wanted = list(range(min(found), max(found) + 1))
+    earlier = _earlier(wanted, found, warmup or 0)
+    wanted = [*earlier, *wanted]
     gaps = [number for number in wanted if number not in found]
     if gaps and (missing == "error" or len(gaps) == len(wanted)):
         there = format_range(found)
@@ -80,7 +90,8 @@ def find_sequence(
             f"Render them, or take a range that is there (--frames {there})"
             + (", or go on without them (--missing hold|reset)." if len(gaps) < len(wanted) else ".")
         )
-    return Sequence(tuple((number, found.get(number)) for number in wanted), text, padding, missing)
+    files = tuple((number, found.get(number)) for number in wanted)
+    return Sequence(files, text, padding, missing, None if warmup is None else len(earlier))
 
 
 def beside(sequence: Sequence, name: str, *, extension: str = ".exr") -> str | None:
@@ -136,6 +147,14 @@ def parse_range(text: str) -> list[int]:
 def format_range(numbers: Iterable[int]) -> str:
     """`1-5,7`: the shortest way to write frame numbers."""
     return FrameSet.framesToFrameRange(numbers, sort=True)
+
+
+def _earlier(wanted: list[int], found: Iterable[int], count: int) -> list[int]:
+    """The numbers of up to so many frames before those that are wanted, from one on that is on the disk."""
+    step = wanted[1] - wanted[0] if len(wanted) > 1 else 1
+    numbers = [wanted[0] - step * i for i in range(count, 0, -1)]
+    first = next((i for i, number in enumerate(numbers) if number in set(found)), count)
+    return numbers[first:]
 
 
 def _single(path: str, number: re.Match | None, wanted: list[int] | None, missing: Missing) -> Sequence:

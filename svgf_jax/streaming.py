@@ -30,8 +30,9 @@ class FrameReport(NamedTuple):
 
     Attributes:
         number: the frame number.
-        status: "filtered", "held" (missing: the frame before it written again) or "skipped" (missing: nothing written).
-        path: the output, None if skipped.
+        status: "filtered", "held" (missing: the frame before it written again), "skipped" (missing: nothing written) or
+            "warm-up" (before the range that is written).
+        path: the output, None if skipped or before the range.
         counts: pixels repaired on loading, before filtering and on writing, by reason, and those of the output that are
             `not_finite`, which should never happen; only those above 0.
         notes: anything else worth telling, as sentences.
@@ -54,9 +55,9 @@ class Summary(NamedTuple):
 
     Attributes:
         out: the output folder.
-        frames: frames in the sequence.
+        frames: frames in the sequence, those that only warm up included.
         resumed_at: how many of them an earlier run had done; 0 unless resumed.
-        statuses: frames of this run by status ("filtered", "held", "skipped").
+        statuses: frames of this run by status (see `FrameReport`).
         counts: repaired and not finite pixels by reason, summed over this run's frames.
         notes: each distinct note of this run's frames.
         interrupted: stopped before the end; `run(..., resume=True)` continues.
@@ -103,7 +104,8 @@ def run(
     Every file appears complete or not at all. Every `checkpoint_every` frames, once their outputs are on disk, the
     history is saved; `resume` continues after that, rewriting what came later, and the result is the same bit for bit.
     A missing frame is held (the output before it is written again, the history kept) or resets the history, as
-    `source.sequence.missing` says.
+    `source.sequence.missing` says. The first `source.sequence.warmup` frames are filtered and not written; runs of several
+    such parts of a sequence may write into one folder at a time.
 
     Args:
         params, config: of `svgf_jax.step`, or of a method of `svgf_jax.methods`: which it is, is told by `config`.
@@ -142,7 +144,7 @@ def run(
         if report is not None:
             now = time.monotonic()
             report, complete_at = report._replace(seconds=now - complete_at), now
-            checkpoint.append_figures(plan.out, report._asdict())
+            checkpoint.append_figures(plan.state, report._asdict())
             statuses[report.status] += 1
             counts.update(report.counts)
             notes[:] = frames.told_once([*notes, *report.notes])
@@ -153,7 +155,7 @@ def run(
         device_name.append(made.device)
         return made
 
-    with _nothing_half_written(plan), checkpoint.lock(plan.out):
+    with _nothing_half_written(plan), checkpoint.lock(plan.state):
         start = begin(plan, resume=resume, overwrite=overwrite)
         end = len(plan.files)
         if start is not None:
@@ -165,8 +167,8 @@ def run(
         if start is not None and end == len(plan.files):
             if plan.video is not None:
                 preview.write_video(plan.video, _pictures(plan, options), fps=fps)
-            checkpoint.save_run(plan.out, plan.identity, complete=True)
-            checkpoint.remove_checkpoint(plan.out)
+            checkpoint.save_run(plan.state, plan.identity, complete=True)
+            checkpoint.remove_checkpoint(plan.state)
     return Summary(
         out=plan.out,
         frames=len(plan.files),
@@ -207,6 +209,7 @@ def prepare(
         hold=source.sequence.missing == "hold",
         png=options.png,
         video=video,
+        warmup=source.sequence.warmup,
         identity=_identity(source, options, provenance) | outputs.numbers(params, config),
         others=[other.files for other in source.files.values()] + _camera_files(source),
     )
@@ -227,7 +230,9 @@ def _filter(
     history, filters = start.history, None
 
     def save(index: int) -> None:
-        submit(partial(checkpoint.save_checkpoint, plan.out, plan.identity, Checkpoint(index, history)), after_all=True)
+        submit(
+            partial(checkpoint.save_checkpoint, plan.state, plan.identity, Checkpoint(index, history)), after_all=True
+        )
 
     for index in range(start.next_index, len(plan.files)):
         try:
@@ -239,7 +244,7 @@ def _filter(
                 save(index)
             raise
         if item is None:
-            if plan.outputs[index] is None:
+            if not plan.hold:
                 history = None
             submit(partial(_fill_gap, plan, index), after_all=True)
         else:
@@ -302,7 +307,9 @@ def _write(
 ) -> FrameReport:
     """Bring one frame's output to the host and onto the disk. Runs in a background thread."""
     path = plan.outputs[index]
-    assert path is not None
+    if path is None:
+        to_host(output.image, item.path)  # waits: frames in the making take memory
+        return FrameReport(plan.files[index][0], "warm-up", None, {}, ())
     output = to_host(output, item.path)
     on_output(item, output)
     image, clipped = outputs.compose(
@@ -324,6 +331,8 @@ def _write(
 def _fill_gap(plan: Plan, index: int) -> FrameReport:
     """Stand in for a missing frame: the output before it again, or nothing. Runs once that output is complete."""
     number, path = plan.files[index][0], plan.outputs[index]
+    if index < plan.warmup:
+        return FrameReport(number, "warm-up", None, {}, ())
     if path is None:
         return FrameReport(number, "skipped", None, {}, ())
     before = plan.outputs[index - 1]
@@ -343,8 +352,7 @@ def _pictures(plan: Plan, options: WriteOptions) -> Iterator[np.ndarray]:
 @contextlib.contextmanager
 def _nothing_half_written(plan: Plan) -> Iterator[None]:
     """Where a run fails before its first output, leave no trace of it."""
-    new_out, new_state = not plan.out.exists(), not (plan.out / checkpoint.FOLDER).exists()
-    state = plan.out / checkpoint.FOLDER
+    new_out, new_state, state = not plan.out.exists(), not plan.state.exists(), plan.state
     try:
         yield
     except BaseException:

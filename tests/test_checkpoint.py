@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from svgf_jax import checkpoint
-from svgf_jax.checkpoint import Checkpoint
+from svgf_jax.checkpoint import Checkpoint, state_folder
 from svgf_jax.plan import begin, make_plan, written
 from svgf_jax.types import History, SvgfError, TaaHistory
 
@@ -24,7 +24,7 @@ IDENTITY = {"parameters": {"alpha": 0.2}, "config": {"levels": 5}, "frames": [[1
 
 @pytest.fixture
 def out(tmp_path):
-    with checkpoint.lock(tmp_path / "out"):
+    with checkpoint.lock(state_folder(tmp_path / "out")):
         yield tmp_path / "out"
 
 
@@ -33,8 +33,8 @@ TAA = TaaHistory(RNG.random((4, 5, 3), np.float32), np.float32(3))
 
 @pytest.mark.parametrize("wanted", [HISTORY, HISTORY._replace(taa=TAA)], ids=["plain", "anti-aliased"])
 def test_round_trip_is_exact(out, wanted):
-    checkpoint.save_checkpoint(out, IDENTITY, Checkpoint(1, wanted))
-    index, history = checkpoint.load_checkpoint(out, IDENTITY)
+    checkpoint.save_checkpoint(state_folder(out), IDENTITY, Checkpoint(1, wanted))
+    index, history = checkpoint.load_checkpoint(state_folder(out), IDENTITY)
     assert index == 1
     assert type(history.taa) is type(wanted.taa)
     for saved, loaded in zip((*wanted[:-1], *(wanted.taa or ())), (*history[:-1], *(history.taa or ())), strict=True):
@@ -43,13 +43,13 @@ def test_round_trip_is_exact(out, wanted):
 
 
 def test_a_checkpoint_without_history(out):
-    checkpoint.save_checkpoint(out, IDENTITY, Checkpoint(2, None))
-    assert checkpoint.load_checkpoint(out, IDENTITY) == (2, None)
+    checkpoint.save_checkpoint(state_folder(out), IDENTITY, Checkpoint(2, None))
+    assert checkpoint.load_checkpoint(state_folder(out), IDENTITY) == (2, None)
 
 
 def test_nothing_there(out):
-    assert checkpoint.load_checkpoint(out, IDENTITY) is None
-    assert checkpoint.load_run(out) is None
+    assert checkpoint.load_checkpoint(state_folder(out), IDENTITY) is None
+    assert checkpoint.load_run(state_folder(out)) is None
 
 
 @pytest.mark.parametrize(
@@ -62,15 +62,15 @@ def test_nothing_there(out):
     ],
 )
 def test_a_checkpoint_of_another_computation_is_refused(out, changed, message):
-    checkpoint.save_checkpoint(out, IDENTITY, Checkpoint(1, HISTORY))
+    checkpoint.save_checkpoint(state_folder(out), IDENTITY, Checkpoint(1, HISTORY))
     with pytest.raises(SvgfError, match=message):
-        checkpoint.load_checkpoint(out, IDENTITY | changed)
+        checkpoint.load_checkpoint(state_folder(out), IDENTITY | changed)
 
 
 def test_frames_still_to_come_may_change(out):
-    checkpoint.save_checkpoint(out, IDENTITY, Checkpoint(1, HISTORY))
+    checkpoint.save_checkpoint(state_folder(out), IDENTITY, Checkpoint(1, HISTORY))
     frames = [IDENTITY["frames"][0], [2, "a.2.exr", 10, 20], [3, "a.3.exr", 10, 20]]
-    assert checkpoint.load_checkpoint(out, IDENTITY | {"frames": frames}).next_index == 1
+    assert checkpoint.load_checkpoint(state_folder(out), IDENTITY | {"frames": frames}).next_index == 1
 
 
 def damage(path, how):
@@ -102,34 +102,40 @@ def damage(path, how):
     "how", ["empty", "cut", "flipped", "text", "pickle", "array", "objects", "incomplete", "later"]
 )
 def test_a_damaged_checkpoint_is_a_clear_error(out, how):
-    checkpoint.save_checkpoint(out, IDENTITY, Checkpoint(1, HISTORY))
+    checkpoint.save_checkpoint(state_folder(out), IDENTITY, Checkpoint(1, HISTORY))
     damage(out / ".svgf-jax" / "checkpoint.npz", how)
     with pytest.raises(SvgfError, match=r"Cannot resume from .*checkpoint\.npz.*--overwrite"):
-        checkpoint.load_checkpoint(out, IDENTITY)
+        checkpoint.load_checkpoint(state_folder(out), IDENTITY)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 9}', '{"format": 1, "identity": {}}'])
 def test_a_damaged_record_is_a_clear_error(out, text):
     (out / ".svgf-jax" / "run.json").write_text(text)
     with pytest.raises(SvgfError, match=r"Cannot resume from .*run\.json"):
-        checkpoint.load_run(out)
+        checkpoint.load_run(state_folder(out))
 
 
 def test_a_second_run_is_kept_out(out):
-    with pytest.raises(SvgfError, match=r"Another run is writing into .*process \d+"), checkpoint.lock(out):
+    with (
+        pytest.raises(SvgfError, match=r"Another run is writing into .*process \d+"),
+        checkpoint.lock(state_folder(out)),
+    ):
         pass
 
 
 def test_the_lock_is_free_again_afterwards(tmp_path):
     for _ in range(2):
-        with checkpoint.lock(tmp_path):
+        with checkpoint.lock(state_folder(tmp_path)):
             pass
 
 
 def test_an_unwritable_place_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
     for place in (tmp_path / "file" / "out", "/proc/nothing/out"):
-        with pytest.raises(SvgfError, match="Cannot write into the output folder"), checkpoint.lock(tmp_path / place):
+        with (
+            pytest.raises(SvgfError, match="Cannot write into the output folder"),
+            checkpoint.lock(state_folder(tmp_path / place)),
+        ):
             pass
 
 
@@ -204,7 +210,7 @@ def test_resume_starts_where_the_checkpoint_says(files, out):
     assert begin(plan, resume=True, overwrite=False) == (0, None)
     finish(plan, 3)
     assert begin(plan, resume=True, overwrite=False) == (0, None)  # killed before the first checkpoint
-    checkpoint.save_checkpoint(out, plan.identity, Checkpoint(2, None))
+    checkpoint.save_checkpoint(state_folder(out), plan.identity, Checkpoint(2, None))
     assert begin(plan, resume=True, overwrite=False) == (2, None)
     with pytest.raises(SvgfError, match=r"parameters\.alpha"):
         begin(plan_of(files, out, identity={"parameters": {"alpha": 0.3}}), resume=True, overwrite=False)
@@ -217,7 +223,7 @@ def test_resuming_a_complete_run(files, out):
     plan = plan_of(files, out)
     begin(plan, resume=False, overwrite=False)
     finish(plan, 4)
-    checkpoint.save_run(out, plan.identity, complete=True)
+    checkpoint.save_run(state_folder(out), plan.identity, complete=True)
     assert begin(plan, resume=True, overwrite=False) is None
     with pytest.raises(SvgfError, match=r"complete with 4 frames; the input has now 5"):
         begin(plan_of([*files, (5, None)], out), resume=True, overwrite=False)

@@ -25,22 +25,23 @@ def test_every_frame_is_seen_and_noted_across_a_break(tmp_path):
     assert run(shot, out, stop=lambda: True, **options).interrupted
     assert run(shot, out, resume=True, **options).resumed_at == 1
     assert seen == {1: 1, 2: 2, 3: 3, 4: 4}
-    figures = checkpoint.load_figures(out)
+    figures = checkpoint.load_figures(checkpoint.state_folder(out))
     for report in reports:
         noted = figures[report.number]
         assert (noted["status"], noted["history"]) == ("filtered", report.number)
         assert noted["seconds"] == report.seconds > 0
     run(shot, out, overwrite=True, stop=lambda: True)
-    assert list(checkpoint.load_figures(out)) == [1]
+    assert list(checkpoint.load_figures(checkpoint.state_folder(out))) == [1]
 
 
 def test_a_damaged_line_counts_for_nothing(tmp_path):
-    (tmp_path / checkpoint.FOLDER).mkdir()
-    checkpoint.append_figures(tmp_path, {"number": 3, "seconds": 1.0})
-    checkpoint.append_figures(tmp_path, {"number": 3, "seconds": 2.0})
-    with (tmp_path / checkpoint.FOLDER / "frames.jsonl").open("a") as file:
+    state = checkpoint.state_folder(tmp_path)
+    state.mkdir()
+    checkpoint.append_figures(state, {"number": 3, "seconds": 1.0})
+    checkpoint.append_figures(state, {"number": 3, "seconds": 2.0})
+    with (state / "frames.jsonl").open("a") as file:
         file.write('[1]\n{"seconds": 3}\n{"number": 4, "sec')
-    assert checkpoint.load_figures(tmp_path) == {3: {"number": 3, "seconds": 2.0}}
+    assert checkpoint.load_figures(state) == {3: {"number": 3, "seconds": 2.0}}
     assert checkpoint.load_figures(tmp_path / "none") == {}
     with pytest.raises(SvgfError, match=r"Could not write .*frames\.jsonl"):
         checkpoint.append_figures(tmp_path / "none", {})

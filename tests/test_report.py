@@ -144,7 +144,7 @@ def test_the_viewer_works_in_a_browser(made):
 
 def test_a_frame_without_a_record_is_unknown(made, tmp_path):
     run, summary, _, _ = made
-    checkpoint.remove_figures(run.out)
+    checkpoint.remove_figures(checkpoint.state_folder(run.out))
     text = report.run_page(run, summary, repairs=terminal.repairs)
     assert "There is no record of frames 1-30" in text
     assert "<td>?</td><td>?</td><td>?</td>" in text

@@ -41,6 +41,7 @@ def denoise(
     out: Annotated[Path, Parameter(name=["--out", "-o"], metavar="FOLDER", group=OUTPUT)],
     frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
     missing: Annotated[Literal["error", "hold", "reset"], Parameter(group=INPUT)] = "error",
+    warmup: Annotated[int | None, Parameter(metavar="FRAMES", group=INPUT)] = None,
     channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = (),
     file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = (),
     cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto",
@@ -80,6 +81,8 @@ def denoise(
         out: The output folder; made if it is not there.
         frames: Only these: 1-100, 1-100x2 or 1,3,5-9.
         missing: A missing frame is an error, repeats the output before it (hold), or starts the history anew (reset).
+        warmup: Filter so many frames before --frames too, to fill the history, and don't write them: the task of a render
+            farm. Such parts of a sequence may be written into one folder at a time.
         channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
         file: The files of a role, for example normal=normal_####.exr. Repeatable.
         cameras: The cameras.json of the sequence, or matrix_#.mat; auto takes the one beside the frames, none ignores it.
@@ -134,6 +137,7 @@ def denoise(
         input_,
         frames=frames,
         missing=missing,
+        warmup=warmup,
         **reading,
         position=getattr(config, "filter", "") == "joint-bilateral",
     )

@@ -21,8 +21,10 @@ def describe_input(source: "Source") -> str:
     numbers = [number for number, path in source.sequence.files if path is not None]
     left, top, right, bottom = source.data_window
     gaps = len(source.sequence.files) - len(numbers)
+    earlier = [number for number, _ in source.sequence.files[: source.sequence.warmup or 0]]
+    warming = f", of which {format_range(earlier)} only to warm up" if earlier else ""
     return (
-        f"input: {source.sequence.name}, {terminal.count(len(numbers), 'frame')} ({format_range(numbers)})"
+        f"input: {source.sequence.name}, {terminal.count(len(numbers), 'frame')} ({format_range(numbers)}{warming})"
         f"{f', {gaps} missing' if gaps else ''}, {right - left + 1} x {bottom - top + 1}"
     )
 
@@ -52,7 +54,7 @@ def rehearse(
     done = len(plan.files) if start is None else start.next_index
     todo = sum(path is not None for _, path in plan.files[done:])
     files = [path for path in written(plan) if path not in set(written(plan, done))] if done else list(written(plan))
-    disk = needs.disk * todo / max(len(scan.there), 1)
+    disk = needs.disk * sum(path is not None for path in plan.outputs[done:]) / max(len(scan.there), 1)
     folder = next(path for path in (plan.out, *plan.out.absolute().parents) if path.exists())
     free = shutil.disk_usage(folder).free
     memory, available = needs.memory, _memory()
