@@ -123,18 +123,20 @@ def _light(facts: Facts, renderer: str) -> Iterator[Finding]:
         if share > FIREFLIES and pixels * math.prod(facts.size) >= 10:
             text = f"{_percent(share)} of the light of {name} is in {_percent(pixels)} of its pixels."
             yield Finding("warning", "fireflies", text, remedy("fireflies", renderer))
-    frames = f"{len(facts.read)} frame{'s' * (len(facts.read) != 1)}"
     for role, (nan, infinite, negative) in facts.broken.items():
         bright = role in (*facts.roles.light, "emission", "environment")
         if nan or infinite:
             kinds = " and ".join(f"{count} {kind}" for count, kind in ((nan, "NaN"), (infinite, "infinite")) if count)
-            text = f"{kinds} pixel{'s' * (nan + infinite != 1)} of {role} in {frames}."
+            text = f"{kinds} pixel{'s' * (nan + infinite != 1)} of {role} in {_frames(facts)}."
             yield Finding(
                 "warning", f"broken {role}", text, remedy("broken light" if bright else "broken guides", renderer)
             )
         if negative:
-            text = f"{negative} negative pixel{'s' * (negative != 1)} of {role} in {frames}."
+            text = f"{negative} negative pixel{'s' * (negative != 1)} of {role} in {_frames(facts)}."
             yield Finding("warning", f"negative {role}", text, remedy("negative light", renderer))
+    if (count := facts.repaired.get("excess", 0)) > 1e-3 * len(facts.read) * math.prod(facts.size):
+        text = f"{count} pixels in {_frames(facts)} have more emission than the beauty that should contain it."
+        yield Finding("warning", "emission", text, remedy("excess", renderer))
     if facts.halves.clipped:
         text = f"{facts.halves.clipped} pixels are as bright as half float can be (65504): their light is cut off."
         yield Finding("warning", "half float", text, remedy("half", renderer))
@@ -149,11 +151,14 @@ def _guides(facts: Facts, renderer: str) -> Iterator[Finding]:
         yield Finding(
             "warning", "background", text, "Look at id, alpha, normal and depth: one of them says that nothing was hit."
         )
+    if (count := facts.repaired.get("guides", 0)) > 1e-3 * len(facts.read) * math.prod(facts.size):
+        text = f"{count} pixels in {_frames(facts)} were hit (by id or alpha), but have no usable depth or normal."
+        yield Finding("warning", "guides", text, remedy("guides", renderer))
     if facts.packed:
         text = "normals are packed: from 0 to 1 in place of -1 to 1."
         yield Finding("warning", "normals", text, remedy("normals packed", renderer))
     elif (count := facts.repaired.get("normal", 0)) and count > 0.01 * len(facts.read) * math.prod(facts.size):
-        text = f"{count} normals in {len(facts.read)} frames are not of unit length: brought to it."
+        text = f"{count} normals in {_frames(facts)} are not of unit length: brought to it."
         yield Finding("note", "normals", text, "")
     if facts.normals is not None and not facts.packed:
         yield from _normals(facts.normals, renderer)
@@ -238,6 +243,10 @@ def _history(facts: Facts, renderer: str) -> Iterator[Finding]:
     if facts.continuity is not None and facts.continuity.share < SHORT and facts.background < 1:
         text = f"only {_percent(facts.continuity.share)} of the pixels find their surface in the frame before."
         yield Finding("warning", "history", text, remedy("history", renderer))
+
+
+def _frames(facts: Facts) -> str:
+    return f"{len(facts.read)} frame{'s' * (len(facts.read) != 1)}"
 
 
 def _percent(share: float) -> str:

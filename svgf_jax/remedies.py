@@ -59,6 +59,12 @@ REMEDIES: dict[str, dict[str, str]] = {
     "still": {
         "": "Nothing to mend: where nothing moves, all conventions are the same.",
     },
+    "guides": {
+        "": "They count as background. Depth in half float is infinite above 65504: write 32-bit, or scale the scene.",
+    },
+    "excess": {
+        "": "Is this beauty without emission? Then give direct and indirect light by hand (--channel direct=NAMES).",
+    },
     "half": {
         "": "Let the renderer write this channel as 32-bit float.",
         "pbrt": '"bool savefp16" false in the film.',

@@ -19,7 +19,9 @@ Planes = Any  # a tree whose leaves are [H, W] arrays
 Sums = TypeVar("Sums")
 
 BY_WIDTH = 0  # rows per strip: as many as have STRIP_PIXELS pixels
-STRIP_PIXELS = 8192  # the fastest of 4 to 64 thousand, at 480 and at 1920 pixels width: a strip's planes fit the level-2 cache
+STRIP_PIXELS = (
+    8192  # the fastest of 4 to 64 thousand, at 480 and at 1920 pixels width: a strip's planes fit the level-2 cache
+)
 UNROLL_FROM = 2**19  # pixels of an image whose taps are unrolled: half the time, for some seconds more of compilation
 
 

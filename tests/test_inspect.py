@@ -90,6 +90,14 @@ def empty(_, planes):
     planes["id"][:] = -1
 
 
+def overflow(_, planes):
+    planes["depth"][40:] = np.inf
+
+
+def glow(_, planes):
+    planes["normal"] = 9 * planes["radiance"]
+
+
 def many(_, planes):
     planes["id"] += 3000 * (planes["id"] != -1)
 
@@ -155,6 +163,14 @@ CASES = {
         "no albedo",
         "will blur",
         "'albedo=albdo [b].R,albdo [b].G,albdo [b].B'",
+    ),
+    "hits too far away": ({"change": overflow, "half": ["depth"]}, {}, "guides", "were hit", "32-bit"),
+    "too much emission": (
+        {"change": glow, "rename": ("normal", "glow")},
+        {"channel": {"emission": ["glow.X", "glow.Y", "glow.Z"]}},
+        "emission",
+        "more emission than",
+        "without emission",
     ),
     "no surface": ({"change": empty}, {}, "background", "no pixel has a surface", "id, alpha"),
     "no motion": ({"drop": ["motion"], "cameras": False}, {}, "no motion", "trails", "--channel motion"),
@@ -289,6 +305,18 @@ def test_a_verdict_counts():
     assert verdict((warning, note)) == "can run, 1 thing to mend"
     assert verdict((error, warning, warning)) == "cannot run: 1 error, 2 things to mend"
     assert verdict((error, error)) == "cannot run: 2 errors"
+
+
+@pytest.mark.parametrize(("name", "motion"), [("cycles/multipart", "pixel y-up to-previous"), ("mitsuba", None)])
+def test_files_that_renderers_wrote_are_understood(name, motion):
+    """Their conventions are converted before the guides are judged, and judged as they are in the files for motion."""
+    facts, found = inspected(Path(__file__).parent / "data" / name)
+    assert facts.normals.best == ("world space",)
+    assert facts.depth.best == ("view z",)
+    assert found.keys() <= {"no id", "fireflies"}
+    if motion is not None:
+        assert motion in map(str, facts.motion.fits)
+        assert facts.samples == ("cycles.ViewLayer.samples", 1)
 
 
 DOCS = Path(__file__).parents[1] / "svgf_jax" / "docs"
