@@ -27,10 +27,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from svgf_jax.motion import parse_convention
 from svgf_jax.toml import read_toml
 from svgf_jax.types import SvgfError
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
+_SPACES = ("camera", "camera z-back", "camera or world")
 FOLDER = Path(__file__).parent / "tables"
 
 
@@ -103,7 +105,20 @@ def _load(path: Path) -> Table:
         raise SvgfError(f"{path}: {error!r} where a table of a renderer was read; see the ones in {FOLDER}.") from error
     if content:
         raise SvgfError(f"{path}: {', '.join(content)} not known; wanted {', '.join(Table._fields[1:])}.")
+    _check_meaning(path, fields["meaning"])
     return Table(**fields)
+
+
+def _check_meaning(path: Path, meaning: Mapping[str, str]) -> None:
+    known = {"depth": ("distance",), "normal": _SPACES, "position": _SPACES}
+    for role, text in meaning.items():
+        if role == "motion":
+            parse_convention(text)
+        elif role == "id" and not text.lstrip("-").isdigit():
+            raise SvgfError(f"{path}: id means {text!r}; wanted the number that stands for no object.")
+        elif role != "id" and text not in known.get(role, ()):
+            wanted = ", ".join(known.get(role, ())) or "no meaning for this role"
+            raise SvgfError(f"{path}: {role} means {text!r}; wanted {wanted}.")
 
 
 def detect_renderer(channels: Collection[str], attributes: Iterable[str] = (), files: Collection[str] = ()) -> Table:

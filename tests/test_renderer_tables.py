@@ -1,5 +1,7 @@
 """Renderers that cannot be run here: tiny files written to their documented conventions. And the tables themselves."""
 
+import json
+
 import numpy as np
 import pytest
 from test_renderers import H, W, planes, put
@@ -309,6 +311,10 @@ def test_a_table_of_ones_own(tmp_path):
         ("[channels]\nalbedo = 3\n", "where a table of a renderer was read"),
         ("chanels = 3\n", "chanels not known; wanted title, detect"),
         ("[[light]]\nchannels = ['a']\n", "KeyError"),
+        ('[meaning]\nid = "none"\n', "id means 'none'; wanted the number"),
+        ('[meaning]\nnormal = "view"\n', "normal means 'view'; wanted camera, camera z-back, camera or world"),
+        ('[meaning]\nalbedo = "sRGB"\n', "albedo means 'sRGB'; wanted no meaning for this role"),
+        ('[meaning]\nmotion = "up"\n', "'up' is not known; wanted one each"),
         ("a = \n", r"mine\.toml:1: not TOML"),
     ],
 )
@@ -330,7 +336,6 @@ def native(number, **more):
 
 def camera_file(folder, numbers):
     """Cameras that go to the right by 0.1 a frame."""
-    import json
 
     screen = [[10, 0, W / 2, 0], [0, 10, H / 2, 0], [0, 0, 1, -0.1], [0, 0, 1, 0]]
     entries = []
@@ -375,3 +380,21 @@ def test_depth_along_the_ray_becomes_z(tmp_path):
     camera_file(tmp_path, [0])
     frame = read_frame(open_source(tmp_path, renderer="mitsuba"), 0).frame
     np.testing.assert_allclose(frame.depth, 4, rtol=1e-6)
+
+
+def test_normals_in_camera_space_come_to_the_world(tmp_path):
+    """Camera turned about y; a table says where its z points."""
+    turn = rotation(0.3)
+    entry = {"frame": 0, "world_to_camera": turn.tolist()}
+    entry["camera_to_screen"] = [[10, 0, W / 2, 0], [0, 10, H / 2, 0], [0, 0, 1, -0.1], [0, 0, 1, 0]]
+    wanted = np.array([0.6, -0.48, -0.64])
+    for words, sign in (("camera", 1), ("camera z-back", -1)):
+        mine = (turn[:3, :3] @ wanted) * [1, -1, sign]  # y up
+        folder = put(tmp_path / str(sign), native(0) | planes("normal", mine, "XYZ"), "frame_0.exr")
+        (folder / "cameras.json").write_text(json.dumps({"per_frame": [entry]}))
+        (tmp_path / "mine.toml").write_text(f'[meaning]\nnormal = "{words}"\n')
+        table = str((tmp_path / "mine.toml").rename(tmp_path / f"mine{sign}.toml"))
+        frame = read_frame(open_source(folder, renderer=table), 0).frame
+        np.testing.assert_allclose(frame.normal, np.broadcast_to(wanted, (H, W, 3)), atol=1e-6)
+        (told,) = [text for text in open_source(folder, renderer=table, cameras=None).warnings if "space" in text]
+        assert told.startswith("normals are in camera space, and no camera is known")
