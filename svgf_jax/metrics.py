@@ -100,13 +100,18 @@ def flip(image: np.ndarray, reference: np.ndarray) -> float:
     _check_shapes(image, reference)
     if np.isnan(image).any() or np.isnan(reference).any():
         return float("nan")
-    return float(_flip(image, reference)[1])
+    _, mean, _ = _flip_evaluator().evaluate(_for_flip(reference), _for_flip(image), "HDR", applyMagma=False)
+    return float(mean)
 
 
 def flip_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """HDR-FLIP of each pixel `[H, W]` in [0, 1], as `flip`; nan counts as 0 here."""
+    """FLIP of each pixel `[H, W]` in [0, 1] of pictures as they are shown: sRGB `[H, W, 3]` in [0, 1] (LDR-FLIP).
+
+    HDR-FLIP, which `flip` gives, is the worst of this over many exposures, and takes that many times as long.
+    """
     _check_shapes(image, reference)
-    return np.asarray(_flip(image, reference)[0])[..., 0]
+    pair = (np.ascontiguousarray(np.clip(np.nan_to_num(x), 0, 1), np.float32) for x in (reference, image))
+    return np.asarray(_flip_evaluator().evaluate(*pair, "LDR", inputsRGB=True, applyMagma=False)[0])[..., 0]
 
 
 def require_flip() -> None:
@@ -200,11 +205,6 @@ def _check_shapes(image: np.ndarray, reference: np.ndarray) -> None:
             f"Cannot compare images of shapes {np.shape(image)} and {np.shape(reference)}: "
             "wanted two images of one shape [height, width, channels]."
         )
-
-
-def _flip(image: np.ndarray, reference: np.ndarray) -> tuple:
-    """(map `[H, W, 1]`, mean, what it did)."""
-    return _flip_evaluator().evaluate(_for_flip(reference), _for_flip(image), "HDR", applyMagma=False)
 
 
 def _for_flip(image: np.ndarray) -> np.ndarray:

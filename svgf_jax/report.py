@@ -104,8 +104,8 @@ def run_page(run: Run, summary: Summary, *, repairs: Callable[[Mapping[str, int]
         )
     if bare := [frame.number for frame in shown if "history length" not in frame.maps.get("denoised", {})]:
         notes.append(
-            f"The filter's maps of frames {format_range(bare)} are unknown: no report was asked for when they were denoised, "
-            "and they have no layers of --diagnostics."
+            f"The filter's maps of frames {format_range(bare)} are unknown: an earlier run denoised them, and only --diagnostics "
+            "keeps them in the files."
         )
     rows = [
         (number, one.get("status", UNKNOWN), *_score_cells(score), *_cells(times, count, mean))

@@ -14,7 +14,7 @@ BYTES = 12_000_000  # of all pictures together, as text
 WORST = 0.1  # the difference that a map shows brightest
 _LEGENDS = {
     "difference": Legend(HEAT, "0", f"{WORST} and more, in x / (1 + x)"),
-    "FLIP": Legend(HEAT, "0", "1, at the size shown"),
+    "FLIP": Legend(HEAT, "0", "1, of the pictures as shown"),
     "variance": Legend(HEAT, "1e-6", "10, in decades"),
     "history found": Legend(GREY, "none", "yes"),
     "change of light": Legend(SIGNED, "darker", "brighter"),
@@ -32,37 +32,28 @@ def shown_frame(
     exposure: float = 1.0,
     curve: str = preview.CURVE,
 ) -> Shown:
-    """One of `count` frames in the viewer: images `[H, W, 3]`, their `maps` and differences from `target`, all encoded.
-
-    FLIP, which takes long, is of those pictures only that are in `maps`.
-    """
+    """One of `count` frames in the viewer: images `[H, W, 3]`, their `maps` and differences from `target`, all encoded."""
     most = share(count, pictures_a_frame)
     every = pictures if target is None else {**pictures, "reference": target}
-    urls = {
-        name: page.picture(preview.to_8bit(image, exposure=exposure, curve=curve), most=most)
-        for name, image in every.items()
-    }
+    shown = {name: preview.to_8bit(image, exposure=exposure, curve=curve) for name, image in every.items()}
+    urls = {name: page.picture(picture, most=most) for name, picture in shown.items()}
     known = {name: dict(maps.get(name, {})) for name in pictures}
     notes = {}
     for name, image in pictures.items() if target is not None else ():
         assert target is not None
         if image.shape == target.shape:
             notes[name] = f"{metrics.psnr(image, target):.2f} dB"
-            known[name] = encoded(_against(image, target, flip=name in maps), most) | known[name]
+            against = {"difference": difference(image, target)}
+            if importlib.util.find_spec("flip_evaluator") is not None:
+                pair = (_fitted(picture / np.float32(255)) for picture in (shown[name], shown["reference"]))
+                against["FLIP"] = page.heat(metrics.flip_map(*pair))
+            known[name] = encoded(against, most) | known[name]
     return Shown(number, urls, {name: found for name, found in known.items() if found}, notes)
 
 
 def difference(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """The map of |image - reference| `[H, W, 3]` uint8, the mean over the channels of x / (1 + x)."""
     return page.heat(np.abs(metrics.display(image) - metrics.display(reference)).mean(-1) / WORST)
-
-
-def _against(image: np.ndarray, reference: np.ndarray, *, flip: bool) -> dict[str, np.ndarray]:
-    found = {"difference": difference(image, reference)}
-    if flip and importlib.util.find_spec("flip_evaluator") is not None:
-        # At full size a frame of 1920 x 1080 would take half a minute.
-        found["FLIP"] = page.heat(metrics.flip_map(_fitted(image), _fitted(reference)))
-    return found
 
 
 def _fitted(image: np.ndarray) -> np.ndarray:
