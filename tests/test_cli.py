@@ -157,7 +157,7 @@ def test_denoise_writes_frames_and_tells_what_it_does(denoised, shots):
     ]
     for number in (1, 2, 3):
         assert re.search(rf"^frame {number}: filtered -> .*shot\.000{number}\.exr", done.stderr, re.M)
-    assert "albedo    albedo.R albedo.G albedo.B (native name)" in done.stderr
+    assert "albedo    albedo.RGB (native name)" in done.stderr
     assert "3 frames (3 filtered) in" in done.stderr
     summary = json.loads(done.stdout)
     assert summary["frames"] == 3
