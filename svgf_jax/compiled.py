@@ -2,18 +2,23 @@
 
 from collections.abc import Callable
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from svgf_jax.methods import MethodConfig
 from svgf_jax.types import Config, Frame, History, Output, SvgfError
 
+Result = TypeVar("Result")
+
 Pipeline = tuple[Callable[..., History], Callable[..., tuple[History, Output]]]  # init, step
 
 
 class Filters(NamedTuple):
-    """`init(frame)` and `step(history, frame)` of NumPy or JAX arrays, and what they run on."""
+    """`init(frame)` and `step(history, frame)` of NumPy or JAX arrays, and what they run on.
+
+    `step` takes the history's memory for the new one: what was passed in must not be read again.
+    """
 
     init: Callable[[Frame], History]
     step: Callable[[History, Frame], tuple[History, Output]]
@@ -21,11 +26,17 @@ class Filters(NamedTuple):
 
 
 def compile_filters(
-    params: Any, config: Config | MethodConfig, *, device: str | None, pipeline: Pipeline | None
+    params: Any,
+    config: Config | MethodConfig,
+    *,
+    device: str | None,
+    pipeline: Pipeline | None,
+    leave_out: tuple[str, ...] = (),
 ) -> Filters:
     """The jitted filter with its parameters on the device.
 
-    `device` is "cpu", "gpu:1", ..., None = JAX's default; `pipeline` is `(init, step)`, None = that of which `config` is.
+    `device` is "cpu", "gpu:1", ..., None = JAX's default; `pipeline` is `(init, step)`, None = that of which `config` is;
+    `leave_out` names fields of `Output` that nobody will read: they are None, and need no memory.
     Raises SvgfError where there is no such device.
     """
     import jax
@@ -39,7 +50,7 @@ def compile_filters(
         from svgf_jax.pipeline import init, step
     chosen = _device(device)
     on_device = jax.device_put(type(params)(*(np.asarray(value, np.float32) for value in params)), chosen)
-    jitted_init, jitted_step = _jitted(init, step, config)
+    jitted_init, jitted_step = _jitted(init, step, config, leave_out)
     return Filters(
         init=lambda frame: jitted_init(jax.device_put(frame, chosen)),
         step=lambda history, frame: jitted_step(*jax.device_put((history, frame), chosen), on_device),
@@ -49,7 +60,7 @@ def compile_filters(
 
 @cache
 def _jitted(
-    init: Callable[..., History], step: Callable[..., Any], config: Config | MethodConfig
+    init: Callable[..., History], step: Callable[..., Any], config: Config | MethodConfig, leave_out: tuple[str, ...]
 ) -> tuple[Callable, Callable]:
     """Compiled once a process, however many sequences it denoises."""
     import jax
@@ -57,7 +68,12 @@ def _jitted(
     start = (
         partial(init, config=config) if getattr(config, "taa", False) else init
     )  # other pipelines know nothing of it
-    return jax.jit(start), jax.jit(lambda history, frame, params: step(history, frame, params=params, config=config))
+
+    def go(history: History, frame: Frame, params: Any) -> tuple[History, Output]:
+        history, output = step(history, frame, params=params, config=config)
+        return history, output._replace(**dict.fromkeys(leave_out))
+
+    return jax.jit(start), jax.jit(go, donate_argnums=0)
 
 
 def _device(name: str | None) -> Any:
@@ -76,15 +92,15 @@ def _device(name: str | None) -> Any:
         ) from error
 
 
-def to_host(output: Any, name: str) -> Any:
-    """An output, or some of its arrays, as NumPy arrays; waits for them.
+def to_host(result: Result, name: str) -> Result:
+    """An output, a history or some arrays as NumPy arrays of their own; waits for them.
 
     `name` says whose it is if the device's memory ran out (SvgfError).
     """
     import jax
 
     try:
-        return jax.tree.map(np.asarray, output)
+        return jax.tree.map(np.array, result)
     except jax.errors.JaxRuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise

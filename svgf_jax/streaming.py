@@ -24,6 +24,12 @@ from svgf_jax.plan import Files, Plan, begin, make_plan, stamp, written
 from svgf_jax.threads import Submit, read_ahead, write_behind
 from svgf_jax.types import Config, History, Output, Params, SvgfError
 
+MANY_PIXELS = 2**20
+"""Frames of more are read and written one at a time, for the sake of memory."""
+
+_NEVER_READ = ("illumination", "variance_filtered")
+_DIAGNOSTICS = ("variance", "change", "valid")
+
 
 class FrameReport(NamedTuple):
     """What became of one frame.
@@ -93,9 +99,9 @@ def run(
     overwrite: bool = False,
     device: str | None = None,
     checkpoint_every: int = 8,
-    threads: int = 2,
+    threads: int | None = None,
     on_frame: Callable[[FrameReport], None] = lambda report: None,
-    on_output: Callable[[frames.LoadedFrame, Output], object] = lambda item, output: None,
+    on_output: Callable[[frames.LoadedFrame, Output], object] | None = None,
     stop: Callable[[], bool] = lambda: False,
     pipeline: Pipeline | None = None,
 ) -> Summary:
@@ -114,10 +120,10 @@ def run(
         resume: continue an interrupted run; begin one where there is none. Excludes `overwrite`.
         overwrite: replace outputs that exist; without it they are an error.
         device: "cpu", "gpu", "gpu:1", ...; None takes JAX's default.
-        threads: frames read ahead, and outputs written behind.
+        threads: frames read ahead, and outputs written behind; None = 2, or 1 where frames are so large that memory counts.
         on_frame: called in this thread for each frame once its output is complete, in order.
         on_output: called in a background thread with each filtered frame and its output, NumPy arrays, before that is written;
-            frames may come in another order.
+            frames may come in another order. Its `illumination` and `variance_filtered` are None.
         stop: asked after each frame; True ends the run with a checkpoint.
         pipeline: `(init, step)` in place of the library's.
 
@@ -127,6 +133,7 @@ def run(
             continues from there.
     """
     began = time.monotonic()
+    threads = (1 if _pixels(source) > MANY_PIXELS else 2) if threads is None else threads
     if checkpoint_every < 1 or threads < 1:
         raise SvgfError(f"Got checkpoint_every {checkpoint_every} and threads {threads}; wanted at least 1 of each.")
     plan, provenance = prepare(
@@ -151,7 +158,8 @@ def run(
             on_frame(report)
 
     def filters() -> Filters:
-        made = compile_filters(params, config, device=device, pipeline=pipeline)
+        leave_out = _NEVER_READ if options.diagnostics or on_output else _NEVER_READ + _DIAGNOSTICS
+        made = compile_filters(params, config, device=device, pipeline=pipeline, leave_out=leave_out)
         device_name.append(made.device)
         return made
 
@@ -163,7 +171,8 @@ def run(
             write = partial(_write, source, plan, options, provenance, on_output)
             loaded = read_ahead(read, range(start.next_index, end), threads=threads)
             with write_behind(done, threads=threads) as submit, contextlib.closing(loaded):
-                end = _filter(plan, start, loaded, filters, write, submit, stop, checkpoint_every)
+                keep = on_output is not None
+                end = _filter(plan, start, loaded, filters, write, submit, stop, checkpoint_every, keep_frames=keep)
         if start is not None and end == len(plan.files):
             if plan.video is not None:
                 preview.write_video(plan.video, _pictures(plan, options), fps=fps)
@@ -225,14 +234,16 @@ def _filter(
     submit: Submit,
     stop: Callable[[], bool],
     checkpoint_every: int,
+    *,
+    keep_frames: bool,
 ) -> int:
     """Filter frame after frame, leaving the writing to `submit`; how many of the sequence's frames are done then."""
     history, filters = start.history, None
 
     def save(index: int) -> None:
-        submit(
-            partial(checkpoint.save_checkpoint, plan.state, plan.identity, Checkpoint(index, history)), after_all=True
-        )
+        # A copy: the next step takes the history's memory.
+        kept = None if history is None else to_host(history, plan.files[index - 1][1] or "")
+        submit(partial(checkpoint.save_checkpoint, plan.state, plan.identity, Checkpoint(index, kept)), after_all=True)
 
     for index in range(start.next_index, len(plan.files)):
         try:
@@ -249,8 +260,9 @@ def _filter(
             submit(partial(_fill_gap, plan, index), after_all=True)
         else:
             filters = filters or make_filters()
-            # The history is not donated: a checkpoint in the background may still be reading it.
             history, output = filters.step(filters.init(item.frame) if history is None else history, item.frame)
+            if not keep_frames:  # what is written needs only the input's other layers
+                item = item._replace(frame=None)  # type: ignore[arg-type]
             submit(partial(write, index, item, output))
         if stop() and index + 1 < len(plan.files):
             save(index + 1)
@@ -280,7 +292,17 @@ def _camera_files(source: frames.Source) -> list[Files]:
 
 
 def _read(source: frames.Source, index: int) -> frames.LoadedFrame | None:
-    return None if source.sequence.files[index][1] is None else frames.read_frame(source, index)
+    if source.sequence.files[index][1] is None:
+        return None
+    item = frames.read_frame(source, index)
+    if (np.asarray(item.frame.object_id) == -1).all():
+        item = item._replace(notes=(*item.notes, "a frame without any surface: it passed through unfiltered"))
+    return item
+
+
+def _pixels(source: frames.Source) -> int:
+    left, top, right, bottom = source.data_window
+    return (right - left + 1) * (bottom - top + 1)
 
 
 def _check_size(item: frames.LoadedFrame, history: History | None) -> None:
@@ -300,7 +322,7 @@ def _write(
     plan: Plan,
     options: WriteOptions,
     provenance: Mapping[str, str],
-    on_output: Callable[[frames.LoadedFrame, Output], object],
+    on_output: Callable[[frames.LoadedFrame, Output], object] | None,
     index: int,
     item: frames.LoadedFrame,
     output: Output,
@@ -311,15 +333,14 @@ def _write(
         to_host(output.image, item.path)  # waits: frames in the making take memory
         return FrameReport(plan.files[index][0], "warm-up", None, {}, ())
     output = to_host(output, item.path)
-    on_output(item, output)
+    if on_output is not None:
+        on_output(item, output)
     image, clipped = outputs.compose(
         output, item.image, options=options, signals=source.roles.signals, attributes=provenance
     )
     notes = list(item.notes)
     if dropped := outputs.write_frame(path, image, options=options):
         notes.append(f"header attributes that could not be passed through: {', '.join(dropped)}")
-    if (np.asarray(item.frame.object_id) == -1).all():
-        notes.append("a frame without any surface: it passed through unfiltered")
     broken = int(np.count_nonzero(~np.isfinite(output.image).all(axis=-1)))
     rejected = {name: int(count) for name, count in output.rejected._asdict().items()}
     counts = Counter(item.counts) + Counter(rejected) + Counter(clipped=clipped, not_finite=broken)

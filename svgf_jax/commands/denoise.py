@@ -181,6 +181,7 @@ def denoise(
         _until_interrupted() as interruption,
         terminal.progress(len(source.sequence.files)) as on_frame,
     ):
+        looks = [look for look in (watch, send) if look is not None]
         summary = streaming.run(
             source,
             out,
@@ -197,7 +198,7 @@ def denoise(
             checkpoint_every=checkpoint_every,
             on_frame=on_frame,
             stop=lambda: bool(interruption),
-            on_output=lambda item, output: [look(item, output) for look in (watch, send) if look is not None],
+            on_output=(lambda item, output: [look(item, output) for look in looks]) if looks else None,
         )
     _conclude(summary, verbose=verbose)
     if report is not None and shown is not None:
