@@ -237,3 +237,36 @@ def test_an_ablation_has_a_page(made, tmp_path, monkeypatch, capsys):
 
 def stand_in(history, frame, params):
     return step(history, frame, params=params, config=Config())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["denoise", "in", "-o", "out", "--reference", "ref"], "--reference ref without --report"),
+        (["compare", "out", "ref", "--before", "in"], "--before in without --report"),
+        (["denoise", "in", "-o", "out", "--report", "there.html"], "there.html exists already"),
+        (["compare", "out", "ref", "--report", "no/page.html"], "Could not write no/page.html"),
+    ],
+)
+def test_what_cannot_be_is_said_before_the_work(arguments, complaint, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.html").touch()
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 2
+    assert complaint in capsys.readouterr().err
+
+
+def test_held_frames_are_shown_without_an_input(tmp_path):
+    shot, out = write_shot(tmp_path / "in", [1, 3]), tmp_path / "out"
+    source = open_source(shot, missing="hold")
+    run = report.Run(source, out, "svgf", "paper", Params(), Config(), WriteOptions(), {}, {})
+    summary = streaming.run(source, out, pipeline=(init, step), on_output=report.watch(run))
+    text = report.run_page(run, summary, repairs=terminal.repairs)
+    assert re.search(r"<tr><td>2</td><td>held</td>.*?<td>\?</td></tr>", text)
+    frames = json.loads(re.search(r'id="frames">(.*?)</script>', text).group(1))["frames"]
+    assert [sorted(frame["pictures"]) for frame in frames] == [
+        ["denoised", "noisy"],
+        ["denoised"],
+        ["denoised", "noisy"],
+    ]
