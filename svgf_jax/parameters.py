@@ -52,7 +52,17 @@ PRESETS: dict[str, tuple[Params, Config]] = {
         Config(),
     ),
     "adaptive": (
-        Params(alpha=0.3, sigma_luminance=(12.0, 8.0, 3.5, 2.5, 1.5), short_history_boost=6.0),
+        Params(
+            alpha=0.3,
+            sigma_depth=0.6,
+            sigma_normal=(4.0, 6.0, 32.0, 64.0, 32.0),
+            sigma_luminance=(40.0, 10.0, 3.5, 2.5, 2.5),
+            short_history_boost=4.0,
+            depth_epsilon=0.004,
+            kernel_near=0.75,
+            kernel_far=0.2,
+            light_sigma_normal=16.0,
+        ),
         Config(light_cell=4),
     ),
 }
