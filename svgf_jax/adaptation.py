@@ -12,7 +12,8 @@ new light at once.
 
 s in [0, 1) is how significant the difference d of the mean luminances is against its own standard error e:
 s = max(0, 1 - (threshold e / d)^4), where e^2 is the variance of the samples' differences inside the neighbourhood over the
-effective number of them. A single firefly among n pixels makes d and e equally large, so it is never significant.
+effective number of them. A single firefly among n pixels makes d and e equally large, so it is never significant. Nor is it
+when there happens to be none: the variance is at least the one that the history remembers.
 
 Then, per pixel, from the four cells around it (bilinear, geometry weights): H' = max(0, g H + o), and the moments move with it:
 M1' = g M1 + o; the variance M2 - M1^2 scales with the square of the light and turns, as s rises, into the one just observed.
@@ -63,6 +64,7 @@ class Sums(NamedTuple):
     Attributes:
         current, previous: color of this frame and of the history.
         current2, product, previous2: of l^2, l prev_l and prev_l^2, for the luminances l and prev_l.
+        noise: of the variance that the history's moments tell.
     """
 
     current: Color
@@ -70,6 +72,7 @@ class Sums(NamedTuple):
     current2: Array
     product: Array
     previous2: Array
+    noise: Array
 
 
 class Compared(NamedTuple):
@@ -78,11 +81,13 @@ class Compared(NamedTuple):
     Attributes:
         current, previous: color of this frame and of the corrected history.
         square: of the squared difference of their luminances.
+        noise: of the variance that the history's moments tell, scaled with the light.
     """
 
     current: Color
     previous: Color
     square: Array
+    noise: Array
 
 
 class Correction(NamedTuple):
@@ -130,7 +135,7 @@ def follow_light(
     history = tuple(split(planes(signal)) for signal in previous.illumination)
     moments = tuple(split(planes(signal)) for signal in previous.moments)
 
-    cells, sums = _gather(guides, slope, known, current, history, size=size, scalars=scalars)
+    cells, sums = _gather(guides, slope, known, current, history, moments, size=size, scalars=scalars)
     corrections = _judge(cells, sums, size=size, scalars=scalars)
     corrected = _apply(cells, corrections, guides, slope, known, history, moments, size=size, scalars=scalars)
     history, moments, change = zip(*corrected, strict=True)
@@ -174,7 +179,9 @@ def _weight(p: Guides, q: Guides, slope: tuple[Array, Array], dy: Array, dx: Arr
     return p.surface * q.surface * jnp.exp(exponent)
 
 
-def _gather(guides, slope, known, current, history, *, size: int, scalars: Params) -> tuple[Cells, tuple[Sums, ...]]:
+def _gather(
+    guides, slope, known, current, history, moments, *, size: int, scalars: Params
+) -> tuple[Cells, tuple[Sums, ...]]:
     """Sums over the cells' own pixels, weighted by likeness to the central one."""
     centre = (size // 2) * (size + 1)
     cell_guides, cell_slope = jax.tree.map(lambda a: a[centre], (guides, slope))
@@ -188,9 +195,9 @@ def _gather(guides, slope, known, current, history, *, size: int, scalars: Param
         totals = jax.tree.map(lambda total, value: total + weight * value, totals, values)
         return (weights + weight, squares + weight * weight, totals), None
 
-    colors = tuple(zip(current, history, strict=True))
+    colors = tuple(zip(current, history, moments, strict=True))
     zero = jnp.zeros(known.shape[1:], known.dtype)
-    nothing = tuple(Sums((zero,) * 3, (zero,) * 3, zero, zero, zero) for _ in colors)
+    nothing = tuple(Sums((zero,) * 3, (zero,) * 3, zero, zero, zero, zero) for _ in colors)
     (weight, square, totals), _ = lax.scan(
         jax.checkpoint(add, prevent_cse=False),  # type: ignore[arg-type]
         (zero, zero, nothing),
@@ -199,10 +206,11 @@ def _gather(guides, slope, known, current, history, *, size: int, scalars: Param
     return Cells(cell_guides, cell_slope, weight, square), totals
 
 
-def _compare(current: Color, history: Color) -> Sums:
+def _compare(current: Color, history: Color, moments) -> Sums:
     current, history = jax.tree.map(lambda c: jnp.minimum(c, largest_luminance(c.dtype)), (current, history))
     l, prev_l = luminance_of_planes(*current), luminance_of_planes(*history)  # noqa: E741
-    return Sums(current, history, l * l, l * prev_l, prev_l * prev_l)
+    noise = jnp.maximum(moments[1] - moments[0] * moments[0], 0.0)
+    return Sums(current, history, l * l, l * prev_l, prev_l * prev_l, noise)
 
 
 def _judge(cells: Cells, sums: tuple[Sums, ...], *, size: int, scalars: Params) -> tuple[Correction, ...]:
@@ -217,8 +225,8 @@ def _judge(cells: Cells, sums: tuple[Sums, ...], *, size: int, scalars: Params) 
 
 def _gains(effective: Array, wide: tuple[Compared, ...], *, threshold) -> tuple[Correction, ...]:
     out = []
-    for current, previous, square in wide:
-        significance, _ = _significance(current, previous, square, effective, threshold)
+    for current, previous, square, noise in wide:
+        significance, _ = _significance(current, previous, square, effective, threshold, noise)
         scale = luminance_of_planes(*previous)
         luminance_gain = _ratio(luminance_of_planes(*current), scale, scale, significance)
         gain = tuple(_ratio(c, p, scale, significance) for c, p in zip(current, previous, strict=True))
@@ -230,8 +238,8 @@ def _gains(effective: Array, wide: tuple[Compared, ...], *, threshold) -> tuple[
 
 def _offsets(effective: Array, narrow: tuple[Compared, ...], gains, *, threshold) -> tuple[Correction, ...]:
     out = []
-    for (current, previous, square), before in zip(narrow, gains, strict=True):
-        significance, observed = _significance(current, previous, square, effective, threshold)
+    for (current, previous, square, noise), before in zip(narrow, gains, strict=True):
+        significance, observed = _significance(current, previous, square, effective, threshold, noise)
         offset = tuple(significance * (c - p) for c, p in zip(current, previous, strict=True))
         either = 1.0 - (1.0 - before.variance) * (1.0 - significance)
         scale = luminance_of_planes(*previous)
@@ -246,7 +254,7 @@ def _correct_sums(sums: tuple[Sums, ...], corrections: tuple[Correction, ...]) -
     for s, c in zip(sums, corrections, strict=True):
         previous = tuple(g * p for g, p in zip(c.gain, s.previous, strict=True))
         square = s.current2 - 2.0 * c.luminance_gain * s.product + c.luminance_gain**2 * s.previous2
-        out.append(Compared(s.current, previous, jnp.maximum(square, 0.0)))
+        out.append(Compared(s.current, previous, jnp.maximum(square, 0.0), c.luminance_gain**2 * s.noise))
     return tuple(out)
 
 
@@ -290,12 +298,14 @@ def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, s
     return in_strips(means, *state)
 
 
-def _significance(current: Color, previous: Color, square: Array, effective: Array, threshold) -> tuple[Array, Array]:
+def _significance(
+    current: Color, previous: Color, square: Array, effective: Array, threshold, remembered: Array
+) -> tuple[Array, Array]:
     """s of the module's docstring, and the variance of the samples' luminance."""
     difference = luminance_of_planes(*current) - luminance_of_planes(*previous)
     change = difference * difference
     variance = jnp.maximum(square - change, 0.0)
-    noise = threshold * threshold * effective * variance
+    noise = threshold * threshold * effective * jnp.maximum(variance, remembered)
     significant = change > noise + _TINY  # inside, the quotient and its derivative are bounded
     return jnp.where(significant, 1.0 - (noise / jnp.where(significant, change, 1.0)) ** 2, 0.0), variance
 

@@ -58,7 +58,7 @@ def pictures(folder: str, out: Path, frames: list[int]) -> None:
     for at, one, other in zip(frames, paper, adaptive, strict=True):
         shown = [preview.to_8bit(image) for image in (references[at], one.image, other.image)]
         rows.append(np.concatenate([halved(p) for p in (*shown, signed(other.change[0]))], axis=1))
-    Image.fromarray(np.concatenate(rows)).quantize(192, dither=Image.Dither.NONE).save(out, optimize=True)
+    Image.fromarray(np.concatenate(rows)).quantize(255).save(out, optimize=True)
 
 
 def cost(folder: str, rounds: int, tile: int) -> None:

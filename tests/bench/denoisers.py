@@ -2,6 +2,7 @@
 
     pip install '.[bench,flip]'        (pyoidn is Intel Open Image Denoise)
     python tests/bench/denoisers.py FOLDER... [--only paper,adaptive] [--frames 0-7] [--no-flip]
+    python tests/bench/denoisers.py --table                                        (what was measured, as Markdown)
 
 A FOLDER holds frame_####.exr and ref_####.exr. PSNR, relMSE, FLIP and temporal error are means over all frames, as
 `svgf-jax compare` measures them; seconds are the median of a frame, compilation and reading left out. Open Image Denoise sees each
@@ -97,13 +98,26 @@ def measure(folder: Path, denoiser: Denoiser, frames: str | None, flip: bool) ->
     return mean_scores(scores)._asdict() | {"seconds": float(np.median(seconds)), "frames": count}
 
 
+def table() -> None:
+    """One row a denoiser and sequence; times beside those of `paper` on the same sequence."""
+    print("| sequence | | PSNR | relMSE | FLIP | temporal | seconds |\n|---|---|---|---|---|---|---|")
+    for sequence, results in json.loads(RESULTS.read_text()).items():
+        for name in denoisers():
+            r = results[name]
+            errors = " | ".join(f"{r[key]:.4f}".lstrip("0") for key in ("relmse", "flip", "temporal"))
+            print(f"| {sequence} | {name} | {r['psnr']:.2f} | {errors} | {r['seconds']:.2f} |")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("folders", nargs="*", type=Path)
+    parser.add_argument("--table", action="store_true")
     parser.add_argument("--only")
     parser.add_argument("--frames")
     parser.add_argument("--no-flip", action="store_true")
     given = parser.parse_args()
+    if given.table:
+        return table()
     known = denoisers()
     names = given.only.split(",") if given.only else list(known)
     for folder in given.folders:
