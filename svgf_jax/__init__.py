@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from svgf_jax.accumulation import clamp_history as clamp_history
     from svgf_jax.antialiasing import taa as taa
     from svgf_jax.antialiasing import taa_init as taa_init
+    from svgf_jax.arrays import frame_of as frame_of
     from svgf_jax.atrous import atrous_filter as atrous_filter
     from svgf_jax.atrous import atrous_level as atrous_level
     from svgf_jax.baselines import baseline_denoise as baseline_denoise
@@ -78,6 +79,7 @@ __version__ = "0.1.0"
 _HOME = {
     "accumulation": ["Accumulated", "accumulate", "clamp_history"],
     "antialiasing": ["taa", "taa_init"],
+    "arrays": ["frame_of"],
     "atrous": ["atrous_filter", "atrous_level"],
     "baselines": ["baseline_denoise", "baseline_init", "baseline_step"],
     "color": ["demodulate", "luminance", "remodulate"],

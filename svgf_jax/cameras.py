@@ -14,6 +14,7 @@ Also understood: `world_to_screen` in place of `camera_to_screen`, and `object_t
 
 import json
 import os
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,9 +73,20 @@ def load_cameras(path: PathName) -> Cameras:
         number = entry.get("frame") if isinstance(entry, dict) else None
         if not isinstance(number, int) or number in frames:
             raise SvgfError(f'{name}: per_frame[{at}] has "frame": {number!r}; wanted a frame number, each only once.')
-        frames[number] = _camera(entry, f"{name}: frame {number}")
+        frames[number] = parse_camera(entry, f"{name}: frame {number}")
     width, height = data.get("width"), data.get("height")
     return Cameras(name, frames, (width, height) if isinstance(width, int) and isinstance(height, int) else None)
+
+
+def parse_camera(entry: Mapping[str, Any], where: str) -> Camera:
+    """The camera of one entry of `per_frame` above, matrices as lists or arrays. Raises SvgfError that begins with `where`."""
+    to_camera = _matrix(entry.get("world_to_camera"), f'{where}: "world_to_camera"')
+    if "camera_to_screen" in entry:
+        to_screen = _matrix(entry["camera_to_screen"], f'{where}: "camera_to_screen"')
+    else:
+        whole = _matrix(entry.get("world_to_screen"), f'{where}: "camera_to_screen" (or "world_to_screen")')
+        to_screen = whole @ np.linalg.inv(to_camera)
+    return Camera(to_camera, to_screen, *(_by_id(entry, key, where) for key in ("object_motion", "object_to_world")))
 
 
 def find_camera(cameras: Cameras, number: int) -> Camera:
@@ -310,19 +322,9 @@ def _object_motion(cameras: Cameras, number: int, previous: int) -> dict[int, np
     return motion
 
 
-def _camera(entry: dict[str, Any], where: str) -> Camera:
-    to_camera = _matrix(entry.get("world_to_camera"), f'{where}: "world_to_camera"')
-    if "camera_to_screen" in entry:
-        to_screen = _matrix(entry["camera_to_screen"], f'{where}: "camera_to_screen"')
-    else:
-        whole = _matrix(entry.get("world_to_screen"), f'{where}: "camera_to_screen" (or "world_to_screen")')
-        to_screen = whole @ np.linalg.inv(to_camera)
-    return Camera(to_camera, to_screen, *(_by_id(entry, key, where) for key in ("object_motion", "object_to_world")))
-
-
-def _by_id(entry: dict[str, Any], key: str, where: str) -> dict[int, np.ndarray]:
+def _by_id(entry: Mapping[str, Any], key: str, where: str) -> dict[int, np.ndarray]:
     objects = entry.get(key) or {}
-    if not isinstance(objects, dict) or not all(name.lstrip("-").isdigit() for name in objects):
+    if not isinstance(objects, Mapping) or not all(str(name).lstrip("-").isdigit() for name in objects):
         raise SvgfError(f'{where}: "{key}" wants matrices by object id, such as {{"7": [[1, 0, 0, 0], ...]}}.')
     return {int(name): _matrix(value, f'{where}: "{key}" of object {name}') for name, value in objects.items()}
 

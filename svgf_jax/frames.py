@@ -15,25 +15,16 @@ import numpy as np
 
 from svgf_jax import exr, renderers
 from svgf_jax.advising import advice
+from svgf_jax.assembly import IN_FRAME, Place, assemble, check_roles, meaning_of
 from svgf_jax.camera_files import find_cameras
-from svgf_jax.cameras import (
-    Cameras,
-    find_camera,
-    mismatch,
-    position_from_depth,
-    previous_depth,
-    reproject,
-)
+from svgf_jax.cameras import Cameras
 from svgf_jax.exr_layout import PathName, Window
-from svgf_jax.motion import convert, parse_convention
-from svgf_jax.planes import guides, in_world, light
-from svgf_jax.reflections import signals_reflected
+from svgf_jax.motion import parse_convention
 from svgf_jax.roles import Roles, canonical_role, check_channels, resolve_roles
 from svgf_jax.sequences import Missing, Sequence, beside, companion, find_sequence, patterns
 from svgf_jax.types import Frame, SvgfError
 
 _BESIDE = ("emission", "albedo", "normal", "depth", "motion", "id", "position")
-_IN_FRAME = " In frame "  # what follows it in a note are that frame's numbers
 
 
 class Source(NamedTuple):
@@ -150,24 +141,15 @@ def open_source(
         roles = settle(near)
     files = {role: other for role, other in files.items() if role in roles.layers}
     found = find_cameras(cameras, sequence, header, path, elsewhere=table.cameras)
-    if position and not ("position" in roles.layers or (found and "depth" in roles.layers)):
-        raise SvgfError(
-            f"{path}: no positions, and no depth with cameras to take them from. Wanted position.X, .Y, .Z "
-            "(--file position=..., --channel position=...), or depth and a cameras.json."
-        )
+    check_roles(roles, found, position=position, where=path)
     if found and roles.layers.keys() & {"depth", "position"} and "motion" not in roles.layers:
         roles = roles._replace(absent=roles.absent | {"motion": f"{found.path} says"})
     if (
         "depth" not in roles.layers
         and "position" in roles.layers
-        and (found or "camera" in _meaning(roles, "position"))
+        and (found or "camera" in meaning_of(roles, "position"))
     ):
         roles = roles._replace(absent=roles.absent | {"depth": "the positions say"})
-    if "world" in _meaning(roles, "motion") and not (found and roles.layers.keys() & {"depth", "position"}):
-        raise SvgfError(
-            f"{path}: motion in world space needs cameras, and positions or depth. Give a cameras.json (--cameras), or say what "
-            "the motion vectors mean if this is wrong (--motion)."
-        )
     half = set()
     for role, one in roles.layers.items():
         types = own[role][1].channels if one.own_file else header.channels
@@ -196,33 +178,16 @@ def read_frame(source: Source, index: int) -> LoadedFrame:
     """
     number, path = source.sequence.files[index]
     planes, image = read_planes(source, index)
-    counts: dict[str, int] = {}
-    notes: list[str] = []
-    with np.errstate(all="ignore"):  # whatever is not finite is dealt with by name below, or by the filter
-        radiance, albedo, emission = light(source.roles, planes, counts)
-        camera = None if source.cameras is None else find_camera(source.cameras, number)
-        planes = in_world(source.roles, planes, camera, _origin(source))
-        object_id, normal, depth = guides(source.roles, planes, radiance.shape[1:3], counts)
-        motion, prev_depth = _past(source, index, planes, depth, object_id, notes)
-        position = _position(source, number, planes, depth, object_id, notes)
-        if "id" in source.half and (largest := np.fmax.reduce(planes["id"], axis=None)) > 2048:
-            notes.append(
-                f"object ids up to {largest:.0f} in half float: above 2048 neighbouring ids become one. "
-                "Let the renderer write ids as 32-bit."
-            )
-    if counts.get("rest", 0) > 0.01 * object_id.size:
-        notes.append(
-            f"the light is more than its parts: what is in none of {', '.join(source.roles.signals)} stays unfiltered. Switch on "
-            f"the passes that are missing.{_IN_FRAME}{number}: {100 * counts['rest'] / object_id.size:.3g} % of the pixels."
-        )
-    measured = [planes[f"{role}_variance"][..., 0] for role in source.roles.signals if f"{role}_variance" in planes]
-    variance = np.stack(measured) if measured else None
-    arrays: list[Any] = [radiance, albedo, emission, normal, depth, prev_depth, motion, object_id, variance]
-    arrays.append(position if source.position else None)
-    pair = {"number": number, "previous": _before(source, index), "origin": _origin(source)}
-    arrays += signals_reflected(source.cameras, source.roles.signals, planes, depth, normal, object_id, **pair)
-    counts = {reason: count for reason, count in counts.items() if count}
-    return LoadedFrame(Frame(*arrays), number, str(path), image, counts, tuple(notes))
+    place = Place(number, _before(source, index), _origin(source), _screen_size(source), source.cameras)
+    frame, counts, notes = assemble(
+        source.roles,
+        planes,
+        place,
+        half=source.half,
+        position=source.position,
+        motion_before=lambda: _motion_of(source, index - 1),
+    )
+    return LoadedFrame(frame, number, str(path), image, counts, notes)
 
 
 def read_planes(source: Source, index: int) -> tuple[dict[str, np.ndarray], exr.Image]:
@@ -262,51 +227,6 @@ def _beside(sequence: Sequence, role: str) -> str | None:
     return next((where for where in found if where), None)
 
 
-def _past(
-    source: Source,
-    index: int,
-    planes: dict[str, np.ndarray],
-    depth: np.ndarray,
-    object_id: np.ndarray,
-    notes: list[str],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Motion `[H, W, 2]` and prev_depth `[H, W]` with respect to the frame that is read before this one."""
-    number = source.sequence.files[index][0]
-    before = _before(source, index)
-    motion = planes.get("motion", np.zeros((*depth.shape, 2), np.float32))
-    prev_depth = depth
-    skipped = before is not None and before != number - 1
-    convention = parse_convention(source.roles.layers["motion"].meaning if "motion" in planes else "")
-    world = motion if convention.unit == "world" else None
-    if "motion" in planes and world is None:
-        later = None
-        if convention.from_frame_before:
-            later = np.zeros_like(motion) if before != number - 1 else _motion_of(source, index - 1)
-        motion = convert(motion, convention, size=_screen_size(source), motion_before=later)
-    if before is not None and source.cameras and planes.keys() & {"depth", "position"}:
-        where: Any = {"number": number, "previous": before, "position": planes.get("position")}
-        where["origin"] = _origin(source)
-        if world is not None and not skipped:
-            here = planes.get("position")
-            if here is None:
-                here = position_from_depth(find_camera(source.cameras, number), depth, origin=_origin(source))
-            way = -1 if convention.direction == "from-previous" else 1
-            where |= {"before": here + way * world, "position": here}
-        if skipped or "motion" not in planes or world is not None:
-            prev_depth, motion = reproject(source.cameras, depth, object_id, **where)
-        else:
-            prev_depth = previous_depth(source.cameras, depth, object_id, **where)
-    elif world is not None:  # nothing before it
-        motion = np.zeros((*depth.shape, 2), np.float32)
-    elif skipped and "motion" in planes:
-        notes.append(
-            f"frame {number} follows frame {before}, but its motion vectors lead to frame {number - 1}; "
-            "a cameras.json would tell the whole way."
-        )
-    sky = (object_id == -1)[..., None]
-    return np.where(sky & ~np.isfinite(motion), 0, motion).astype(np.float32), prev_depth
-
-
 def _motion_of(source: Source, index: int) -> np.ndarray:
     """The motion vectors of another frame, as its file has them."""
     layer = source.roles.layers["motion"]
@@ -320,30 +240,6 @@ def _before(source: Source, index: int) -> int | None:
     """The number of the frame that is read before this one."""
     earlier = (source.sequence.files[i] for i in range(index - 1, -1, -1))
     return next((other for other, path in earlier if path is not None), None)
-
-
-def _position(
-    source: Source,
-    number: int,
-    planes: dict[str, np.ndarray],
-    depth: np.ndarray,
-    object_id: np.ndarray,
-    notes: list[str],
-) -> np.ndarray | None:
-    """World positions `[H, W, 3]`, if they are wanted or there; with cameras it is checked that they belong to them."""
-    surface = object_id != -1
-    position = planes.get("position")
-    if source.cameras is None:
-        return position
-    camera = find_camera(source.cameras, number)
-    if position is not None:
-        known = depth if "depth" in planes else None
-        seen = surface & np.isfinite(position).all(-1)
-        if found := mismatch(camera, position, known, seen, origin=_origin(source)):
-            notes.append(f"{source.cameras.path}: {found[0]}{_IN_FRAME}{number}: {found[1]}")
-    elif source.position:
-        position = position_from_depth(camera, np.where(surface, depth, 1.0), origin=_origin(source)).astype(np.float32)
-    return position
 
 
 def check_windows(image: exr.Image | exr.Header, path: str, source: Source) -> None:
@@ -360,7 +256,7 @@ def told_once(notes: Iterable[str]) -> tuple[str, ...]:
     """Each note once; of those that only tell another frame's numbers, the first."""
     first: dict[str, str] = {}
     for note in notes:
-        first.setdefault(note.partition(_IN_FRAME)[0], note)
+        first.setdefault(note.partition(IN_FRAME)[0], note)
     return tuple(first.values())
 
 
@@ -374,11 +270,6 @@ def _screen_size(source: Source) -> tuple[int, int]:
     """Width and height of the whole picture."""
     left, top, right, bottom = source.display_window
     return right - left + 1, bottom - top + 1
-
-
-def _meaning(roles: Roles, role: str) -> list[str]:
-    """The words of what a role's numbers mean."""
-    return roles.layers[role].meaning.split() if role in roles.layers else []
 
 
 def _find_frames(pattern: PathName, table: renderers.Table | None, **options: Any) -> Sequence:

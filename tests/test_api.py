@@ -39,7 +39,7 @@ def test_the_public_names_are_these():
         *("preset", "load_params", "save_params"),
         *("Sums", "Welford", "start_sums", "start_welford", "add_sample", "merge_samples"),
         *("mean_of", "variance_of", "variance_of_mean"),
-        *("open_source", "read_frame", "load_sequence", "load_reference", "read_radiance", "sample"),
+        *("frame_of", "open_source", "read_frame", "load_sequence", "load_reference", "read_radiance", "sample"),
     }
 
 
