@@ -16,7 +16,6 @@ from svgf_jax.findings import Finding, judge, verdict
 from svgf_jax.frames import open_source
 from svgf_jax.inspection import inspect_source
 from svgf_jax.remedies import REMEDIES, remedy
-from svgf_jax.types import Config, Params
 
 
 def inspected(folder, **options):
@@ -329,15 +328,3 @@ def test_the_page_shows_what_it_prints(capsys):
     out = run(capsys, "inspect", sample(), "--motion", "y-up")[1]
     words = [re.sub(r"\S*/\S*/\S*|[-\d.e]+", "", text).split() for text in (shown, out)]
     assert words[0] == words[1]
-
-
-@pytest.mark.parametrize("name", ["inspect.md", "troubleshooting.md"])
-def test_links_and_flags_of_the_pages_are_real(name, capsys):
-    page = (DOCS / name).read_text(encoding="utf-8")
-    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page):
-        assert (DOCS / target).exists(), target
-    known = run(capsys, "denoise", "--help")[1] + run(capsys, "inspect", "--help")[1]
-    for flag in set(re.findall(r"(--[a-z][a-z-]*)", page)):
-        assert flag in known, flag
-    for parameter in set(re.findall(r"--set (\w+)=", page)):
-        assert parameter in (*Params._fields, *Config._fields), parameter

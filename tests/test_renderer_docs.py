@@ -16,17 +16,6 @@ MULTIPART = ROOT / "tests" / "data" / "cycles"
 
 def test_every_renderer_is_on_the_page():
     assert not [name for name in renderer_names()[1:] if f"`{name}`" not in PAGE]
-    for target in re.findall(r"\]\(([^)#:]+)[^)]*\)", PAGE):
-        assert (ROOT / "svgf_jax" / "docs" / target).exists(), target
-
-
-def test_the_commands_of_the_page_have_the_options_that_exist(capsys):
-    with pytest.raises(SystemExit):
-        main(["denoise", "--help"])
-    told = capsys.readouterr().out
-    used = {option for line in re.findall(r"svgf-jax denoise.*", PAGE) for option in re.findall(r"--[a-z-]+", line)}
-    assert used >= {"--renderer", "--layer", "--motion"}
-    assert not [option for option in used if option not in told]
 
 
 def test_the_table_on_the_page_loads(tmp_path):
