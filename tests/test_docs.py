@@ -1,13 +1,17 @@
-"""Every page says what is so: links and files exist, commands parse, flags and names are real."""
+"""Every page says what is so: links and files exist, commands parse, flags and names are real, what is generated is current."""
 
+import ast
+import importlib.util
 import re
 import shlex
 from functools import cache
 from pathlib import Path
 
+import api_page
 import pytest
 from cyclopts import CycloptsError
 
+import svgf_jax
 from svgf_jax.cli import app
 from svgf_jax.methods import METHOD_CHOICES, METHODS, method
 from svgf_jax.parameters import PRESETS
@@ -153,3 +157,36 @@ def test_settings_and_presets_are_real(page):
     assert set(re.findall(r"--set (\w+)=", text)) - {"NAME"} <= SETTINGS
     assert set(re.findall(r"--preset (\w+)", text)) - {"NAME"} <= set(PRESETS)
     assert set(re.findall(r"--method ([\w-]+)", text)) - {"NAME"} <= {"svgf", *METHODS}
+
+
+def test_the_index_leads_to_every_page():
+    index = (DOCS / "README.md").read_text(encoding="utf-8")
+    assert not [page.name for page in DOCS.glob("*.md") if page.name != "README.md" and f"({page.name})" not in index]
+    assert "(svgf_jax/docs/README.md)" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_api_page_is_current():
+    current = (DOCS / "api.md").read_text(encoding="utf-8")
+    assert current == api_page.page(), "run python tests/api_page.py"
+
+
+def test_the_drawing_is_current_and_names_public_functions():
+    spec = importlib.util.spec_from_file_location("draw_pipeline", ROOT / "tests" / "bench" / "draw_pipeline.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    current = (DOCS / "pipeline.svg").read_text(encoding="utf-8")
+    assert current == script.drawing(), "run python tests/bench/draw_pipeline.py"
+    names = [stage[0] for stage in script.STAGES]
+    assert set(names) - set(svgf_jax.__all__) == {"follow the light"}
+    assert (DOCS / "stages.jpg").stat().st_size < 250_000
+    calls = [
+        node.func.id for node in ast.walk(step()) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    ]
+    order = [name.replace("follow the light", "follow_light") for name in names]
+    assert [name for name in calls if name in order] == order
+
+
+def step():
+    """The source of `svgf_jax.step`, whose calls in order are the stages."""
+    nodes = ast.parse((ROOT / "svgf_jax" / "pipeline.py").read_text(encoding="utf-8")).body
+    return next(node for node in nodes if isinstance(node, ast.FunctionDef) and node.name == "step")
