@@ -12,6 +12,7 @@ from pathlib import Path
 
 DOCS = Path(__file__).parents[2] / "svgf_jax" / "docs"
 FRAME = 7  # of the sample: the box has moved, and uncovered wall
+COLUMNS = slice(30, 190)  # of it that the strip shows
 WIDTH, LEFT, BOX, RIGHT = 920, 270, 330, 650  # of the drawing; x of the boxes, their width, x of the history
 
 STYLE = """
@@ -182,20 +183,20 @@ def strip():
     rows = [
         [
             ("noisy frame", shown(noisy)),
-            ("demodulate: the light", light(illumination)),
-            ("reproject: its past", light(previous.illumination)),
-            (f"history_length: 0 to {FRAME + 1}", heat(np.asarray(accumulated.history_length) / (FRAME + 1))),
+            ("demodulate", light(illumination)),
+            ("reproject", light(previous.illumination)),
+            (f"history_length, 0-{FRAME + 1}", heat(np.asarray(accumulated.history_length) / (FRAME + 1))),
             ("accumulate", light(accumulated.illumination)),
         ],
         [
-            ("estimate_variance, decades", heat((decades + 6) / 7)),
-            ("atrous_level 0: fed back", light(first)),
-            ("atrous_filter: 5 levels", light(filtered)),
-            ("modulate: the image", shown(image)),
+            ("estimate_variance", heat((decades + 6) / 7)),
+            ("atrous_level 0", light(first)),
+            ("atrous_filter", light(filtered)),
+            ("modulate", shown(image)),
             ("reference", shown(reference)),
         ],
     ]
-    return np.concatenate([side_by_side(row) for row in rows])
+    return np.concatenate([side_by_side([(label, picture[:, COLUMNS]) for label, picture in row]) for row in rows])
 
 
 def main():
