@@ -4,6 +4,7 @@ import ast
 import importlib.util
 import re
 import shlex
+import tomllib
 from functools import cache
 from pathlib import Path
 
@@ -157,6 +158,23 @@ def test_settings_and_presets_are_real(page):
     assert set(re.findall(r"--set (\w+)=", text)) - {"NAME"} <= SETTINGS
     assert set(re.findall(r"--preset (\w+)", text)) - {"NAME"} <= set(PRESETS)
     assert set(re.findall(r"--method ([\w-]+)", text)) - {"NAME"} <= {"svgf", *METHODS}
+
+
+def test_parameter_and_project_files_on_the_pages_are_right(tmp_path):
+    kinds = set()
+    for page in PAGES:
+        for text in (text for language, text in blocks(page) if language == "toml"):
+            tables = tomllib.loads(text)
+            if "params" in tables:
+                (tmp_path / "mine.toml").write_text(text)
+                params, config = svgf_jax.load_params(tmp_path / "mine.toml")
+                assert (params, config) != (Params(), Config())
+                kinds.add("parameters")
+                continue
+            for command in (name for name in tables if name in app):
+                assert {f"--{key}" for key in tables[command]} <= flags_of(("svgf-jax", command))
+                kinds.add("project")
+    assert kinds == {"parameters", "project"}
 
 
 def test_the_index_leads_to_every_page():
