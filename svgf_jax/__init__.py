@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from svgf_jax.color import luminance as luminance
     from svgf_jax.color import remodulate as remodulate
     from svgf_jax.demo import sample as sample
+    from svgf_jax.devices import step_over as step_over
     from svgf_jax.edges import Guides as Guides
     from svgf_jax.edges import depth_gradient as depth_gradient
     from svgf_jax.edges import edge_weight as edge_weight
@@ -84,6 +85,7 @@ _HOME = {
     "baselines": ["baseline_denoise", "baseline_init", "baseline_step"],
     "color": ["demodulate", "luminance", "remodulate"],
     "demo": ["sample"],
+    "devices": ["step_over"],
     "edges": ["Guides", "depth_gradient", "edge_weight", "guides_of"],
     "frames": ["load_sequence", "open_source", "read_frame"],
     "joint_bilateral": ["bilateral_filter", "gaussian_filter", "joint_bilateral_filter"],

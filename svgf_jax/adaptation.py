@@ -30,7 +30,7 @@ from jax import Array, lax
 
 from svgf_jax.color import largest_luminance, luminance_of_planes
 from svgf_jax.edges import Guides, depth_gradient, geometry_exponent, guides_of
-from svgf_jax.sampling import in_strips, planes, square_offsets, sum_over_taps
+from svgf_jax.sampling import add_margin, in_strips, planes, square_offsets, sum_over_taps
 from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
 
 GAIN_LEVELS = 3  # a-trous levels on the grid of cells: reach of +-14 cells
@@ -328,8 +328,7 @@ def _apply(cells: Cells, corrections, guides, slope, known, history, moments, *,
     cell = first[:, None] + corners  # [size^2, 4, 2]
     share = np.where(corners == 1, fraction[:, None], 1.0 - fraction[:, None]).prod(axis=-1)
     distance = jnp.asarray(cell * size - offset[:, None], known.dtype)
-    around = (cells.guides, (cells.weight > _TINY).astype(known.dtype), corrections)
-    around = jax.tree.map(lambda plane: jnp.pad(plane, 1), around)
+    around = add_margin((cells.guides, (cells.weight > _TINY).astype(known.dtype), corrections), 1, 1)
 
     def pixel(phase):
         p, p_slope, with_history, colors, pairs, corner, shares, away = phase

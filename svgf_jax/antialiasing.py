@@ -10,7 +10,17 @@ import numpy as np
 from jax import Array, lax
 
 from svgf_jax.check import check_image, check_taa
-from svgf_jax.sampling import BY_WIDTH, in_strips, planes, read_at, square_offsets, sum_over_taps
+from svgf_jax.sampling import (
+    BY_WIDTH,
+    in_strips,
+    inside_image,
+    place,
+    planes,
+    read_at,
+    square_offsets,
+    sum_over_taps,
+    whole,
+)
 from svgf_jax.tonemapping import compress_luma, expand_luma
 from svgf_jax.types import Params, TaaHistory, at_level
 
@@ -72,16 +82,18 @@ def taa(
     (display,) = in_strips(lambda color: (compress_luma(color),), linear, strip_rows=strip_rows)
     nearest, box = _neighbourhood(nearness, (*moved, usable.astype(dtype)), display, strip_rows)
 
-    y, x = (lax.broadcasted_iota(jnp.int32, (height, width), axis).astype(dtype) for axis in (0, 1))
-    past = planes(history.color)
+    above, image_height = place(depth)
+    row, column = (lax.broadcasted_iota(jnp.int32, (height, width), axis) for axis in (0, 1))
+    y, x = (above + row).astype(dtype), column.astype(dtype)
+    past = whole(planes(history.color))
     a = jnp.maximum(alpha, 1.0 / (history.frames + 1.0))
     started = history.frames > 0.0
 
     def resolve(linear, display, nearest, box, y, x):
         motion_x, motion_y, usable = nearest
         at_x = jnp.clip(x + motion_x, -_FAR, width + _FAR)
-        at_y = jnp.clip(y + motion_y, -_FAR, height + _FAR)
-        inside = (at_x >= -0.5) & (at_x <= width - 0.5) & (at_y >= -0.5) & (at_y <= height - 0.5)
+        at_y = jnp.clip(y + motion_y, -_FAR, image_height + _FAR)
+        inside = (at_x >= -0.5) & (at_x <= width - 0.5) & (at_y >= -0.5) & (at_y <= image_height - 0.5)
         valid = inside & (usable > 0.5) & started
         clipped = _to_rgb(_clip_to_box(_to_ycocg(_read_cubic(past, at_y, at_x)), *box))
         blended = tuple((1.0 - a) * old + a * new for old, new in zip(clipped, display, strict=True))
@@ -97,7 +109,7 @@ def taa(
 
 def _neighbourhood(nearness: Array, motion: tuple[Array, ...], display: tuple[Array, ...], strip_rows: int):
     """Over the 3 x 3: the motion of the nearest pixel (of equals the first, the centre before all), and the YCoCg box."""
-    inside = jnp.ones_like(nearness)
+    inside = inside_image(nearness)
     neighbours = {"near": nearness, "motion": motion, "color": _to_ycocg(display), "inside": inside}
 
     def tap(sums, q, p, t):

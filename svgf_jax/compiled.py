@@ -1,8 +1,9 @@
 """The filter compiled for a device, with its parameters there. Imports JAX when first used, not before."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache, partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -31,11 +32,13 @@ def compile_filters(
     *,
     device: str | None,
     pipeline: Pipeline | None,
+    devices: int = 1,
     leave_out: tuple[str, ...] = (),
 ) -> Filters:
     """The jitted filter with its parameters on the device.
 
     `device` is "cpu", "gpu:1", ..., None = JAX's default; `pipeline` is `(init, step)`, None = that of which `config` is;
+    `devices`: so many of the kind share the rows of each frame (of SVGF only, see `check_devices`);
     `leave_out` names fields of `Output` that nobody will read: they are None, and need no memory.
     Raises SvgfError where there is no such device.
     """
@@ -48,23 +51,48 @@ def compile_filters(
         from svgf_jax.baselines import baseline_step as step
     else:
         from svgf_jax.pipeline import init, step
-    chosen = _device(device)
-    on_device = jax.device_put(type(params)(*(np.asarray(value, np.float32) for value in params)), chosen)
-    jitted_init, jitted_step = _jitted(init, step, config, leave_out)
+    chosen = _devices(device, devices)
+    numbers = type(params)(*(np.asarray(value, np.float32) for value in params))
+    if devices == 1:
+        put = partial(jax.device_put, device=chosen[0])
+        numbers = put(numbers)
+    else:
+        from svgf_jax.devices import spread
+
+        put = partial(spread, devices=chosen, config=cast(Config, config))  # `check_devices` saw to it
+    jitted_init, jitted_step = _jitted(init, step, config, leave_out, chosen)
     return Filters(
-        init=lambda frame: jitted_init(jax.device_put(frame, chosen)),
-        step=lambda history, frame: jitted_step(*jax.device_put((history, frame), chosen), on_device),
-        device=f"{chosen.platform}: {chosen.device_kind}",
+        init=lambda frame: jitted_init(put(frame)),
+        step=lambda history, frame: jitted_step(*put((history, frame)), numbers),
+        device=f"{f'{devices} x ' if devices > 1 else ''}{chosen[0].platform}: {chosen[0].device_kind}",
     )
+
+
+def check_devices(config: Config | MethodConfig, device: str | None, devices: int) -> None:
+    """Raise SvgfError where frames could not be divided over so many devices, before JAX is asked."""
+    if devices < 1:
+        raise SvgfError(f"Got {devices} devices; wanted 1 or more.")
+    if devices > 1 and isinstance(config, MethodConfig):
+        raise SvgfError(f"Got {devices} devices for another method than svgf; wanted 1: only svgf divides a frame.")
+    if devices > 1 and ":" in (device or ""):
+        raise SvgfError(f"Got device {device} and {devices} devices; wanted a kind, cpu or gpu, or one device.")
 
 
 @cache
 def _jitted(
-    init: Callable[..., History], step: Callable[..., Any], config: Config | MethodConfig, leave_out: tuple[str, ...]
+    init: Callable[..., History],
+    step: Callable[..., Any],
+    config: Config | MethodConfig,
+    leave_out: tuple[str, ...],
+    devices: tuple[Any, ...],
 ) -> tuple[Callable, Callable]:
     """Compiled once a process, however many sequences it denoises."""
     import jax
 
+    if len(devices) > 1:
+        from svgf_jax.devices import step_over
+
+        step = partial(cast(Any, step_over), devices=devices)
     start = (
         partial(init, config=config) if getattr(config, "taa", False) else init
     )  # other pipelines know nothing of it
@@ -76,13 +104,16 @@ def _jitted(
     return jax.jit(start), jax.jit(go, donate_argnums=0)
 
 
-def _device(name: str | None) -> Any:
-    """The JAX device called "cpu", "gpu:1", ...; the default one for None."""
+def _devices(name: str | None, count: int) -> tuple[Any, ...]:
+    """The JAX device called "cpu", "gpu:1", ..., the default one for None; or so many of the kind."""
     import jax
 
+    if count > 1:
+        with suppress(RuntimeError):  # JAX has started: it has the CPUs that it has
+            jax.config.update("jax_num_cpu_devices", count)
     platform, _, number = (name or "").partition(":")
     try:
-        return jax.devices(platform or None)[int(number or 0)]
+        first = jax.devices(platform or None)[int(number or 0)]
     except (RuntimeError, IndexError, ValueError) as error:
         there = ", ".join(
             sorted({f"{device.platform}:{device.id}" for device in [*jax.devices(), *jax.devices("cpu")]})
@@ -90,6 +121,15 @@ def _device(name: str | None) -> Any:
         raise SvgfError(
             f"There is no device {name!r} here; there is {there}. Try one of these, or leave it out."
         ) from error
+    if count == 1:
+        return (first,)
+    there = jax.local_devices(backend=first.platform)
+    if len(there) < count:
+        raise SvgfError(
+            f"Got {count} devices; there are {len(there)} ({first.device_kind}). Try --devices {len(there)}, and for CPUs set "
+            "JAX_NUM_CPU_DEVICES before JAX starts."
+        )
+    return tuple(there[:count])
 
 
 def to_host(result: Result, name: str) -> Result:

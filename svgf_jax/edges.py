@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from svgf_jax.sampling import planes, shift
+from svgf_jax.sampling import inside_image, planes, shift
 from svgf_jax.types import Frame
 
 NEVER = -1e4  # exp of this is 0 in every float type
@@ -40,7 +40,7 @@ def depth_gradient(depth: Array, object_id: Array) -> tuple[Array, Array]:
     Of the two one-sided differences to neighbours with the same object id, the one of smaller magnitude; on equal magnitude and
     opposite sign their mean, so that flips commute; 0 where there is no such neighbour.
     """
-    inside = jnp.ones_like(object_id)
+    inside = inside_image(object_id)
 
     def along(dy: int, dx: int) -> Array:
         def side(sign: int) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from svgf_jax.sampling import BY_WIDTH, planes, read_at, split_rows, square_offsets, stack_planes
+from svgf_jax.sampling import BY_WIDTH, place, planes, read_at, split_rows, square_offsets, stack_planes, whole
 from svgf_jax.types import Config, Frame, History, Params, Reprojected, at_level
 
 _LEAST_WEIGHT = 0.01  # of the consistent ones of the 2 x 2 taps, to be trusted
@@ -39,8 +39,10 @@ def reproject(
     scalars = at_level(params, 0)
     height, width = frame.depth.shape
     count, rows = (1, height) if strip_rows is None else split_rows(height, width, strip_rows)
-    guides = {"id": history.object_id, "depth": history.depth, "normal": planes(history.normal)}
+    above, image_height = place(frame.depth)
+    guides = whole({"id": history.object_id, "depth": history.depth, "normal": planes(history.normal)})
     values = (tuple(map(planes, history.illumination)), tuple(map(planes, history.moments)), history.history_length)
+    values = whole(values)
     current = {
         "id": frame.object_id,
         "depth": frame.prev_depth,
@@ -75,7 +77,7 @@ def reproject(
 
     def strip(first_row: Array):
         p = jax.tree.map(lambda a: lax.dynamic_slice(a, (first_row, jnp.zeros_like(first_row)), (rows, width)), padded)
-        x, y = (_position(p["motion"][axis], first_row, axis, (width, height)[axis]) for axis in (0, 1))
+        x, y = (_position(p["motion"][axis], above + first_row, axis, (width, image_height)[axis]) for axis in (0, 1))
 
         def nearest():
             return jnp.floor(y + 0.5).astype(jnp.int32), jnp.floor(x + 0.5).astype(jnp.int32)

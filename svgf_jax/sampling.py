@@ -3,6 +3,10 @@
 The border rule: a tap outside the image counts for nothing. Planes read 0 there, and every sum carries a plane that says
 where a surface is (`surface` of `edges.Guides`), which reads 0 outside too.
 
+The rows of an image may be divided over devices (`svgf_jax.devices`). A plane is then the rows of one device, and what lies above
+and below them is fetched from the others. Whether they are, and over which, is told by the mesh that JAX traces for; it is part of
+what JAX caches by, as a variable of ours would not be.
+
 Here an image is a tree of *planes* `[H, W]`, one a channel: on XLA:CPU a slice of a plane is vectorised, a slice of `[C, H, W]`
 or `[H, W, C]` is not, and costs ten times as much.
 """
@@ -22,6 +26,9 @@ BY_WIDTH = 0  # rows per strip: as many as have STRIP_PIXELS pixels
 STRIP_PIXELS = (
     8192  # the fastest of 4 to 64 thousand, at 480 and at 1920 pixels width: a strip's planes fit the level-2 cache
 )
+DIVIDED = (
+    "svgf_jax rows of "  # how the mesh axis is called over which the rows are divided, and then the image's height
+)
 UNROLL_FROM = 2**19  # pixels of an image whose taps are unrolled: half the time, for some seconds more of compilation
 
 
@@ -38,10 +45,81 @@ def stack_planes(signals: tuple[tuple[Array, ...], ...]) -> Array:
 def shift(plane: Array, dy: int, dx: int) -> Array:
     """The neighbour at (+dx, +dy): `shift(a, dy, dx)[y, x] == a[y + dy, x + dx]`, 0 outside the image. `[H, W]`."""
     height, width = plane.shape
+    if dy and _division(plane)[0] is not None:
+        return shift(add_margin(plane, abs(dy), 0), 0, dx)[abs(dy) + dy :][:height]
     if abs(dy) >= height or abs(dx) >= width:
         return jnp.zeros_like(plane)
     inside = plane[max(dy, 0) : height + min(dy, 0), max(dx, 0) : width + min(dx, 0)]
     return jnp.pad(inside, ((max(-dy, 0), max(dy, 0)), (max(-dx, 0), max(dx, 0))))
+
+
+def add_margin(image: Planes, rows: int, columns: int) -> Planes:
+    """Planes with so many more rows and columns on every side, 0 outside the image. `[H + 2 rows, W + 2 columns]`."""
+    leaves, tree = jax.tree.flatten(image)
+    axis, devices, _ = _division(leaves[0])
+    if axis is None or rows == 0:
+        return jax.tree.map(lambda a: jnp.pad(a, ((rows, rows), (columns, columns))), image)
+    height = leaves[0].shape[0]
+    above, below = [], []
+    for hop in range(1, -(-rows // height) + 1):  # a device with few rows needs some of the next but one
+        count = min(height, rows - (hop - 1) * height)
+        down = [(i, i + hop) for i in range(devices - hop)]  # 0 arrives where no device is named
+        up = [(j, i) for i, j in down]
+        above.insert(
+            0, _together(lambda a, down=down: lax.ppermute(a, axis, down), [a[height - count :] for a in leaves])
+        )
+        below.append(_together(lambda a, up=up: lax.ppermute(a, axis, up), [a[:count] for a in leaves]))
+    taller = (jnp.concatenate(parts) for parts in zip(*above, leaves, *below, strict=True))
+    return tree.unflatten(jnp.pad(a, ((0, 0), (columns, columns))) for a in taller)
+
+
+def place(plane: Array) -> tuple[int | Array, int]:
+    """The number of the plane's first row in the image, and the image's height."""
+    axis, _, height = _division(plane)
+    return (0, height) if axis is None else (lax.axis_index(axis) * plane.shape[0], height)
+
+
+def inside_image(plane: Array) -> Array:
+    """1 inside the image; 0 in rows that the last device has beyond it. `[H, W]`, of the plane's type."""
+    first, height = place(plane)
+    if isinstance(first, int):
+        return jnp.ones_like(plane)
+    rows = first + lax.broadcasted_iota(jnp.int32, plane.shape, 0)
+    return (rows < height).astype(plane.dtype)
+
+
+def whole(image: Planes) -> Planes:
+    """Planes with all rows of the image, for `read_at`."""
+    leaves, tree = jax.tree.flatten(image)
+    axis, _, _ = _division(leaves[0])
+    if axis is None:
+        return image
+    return tree.unflatten(_together(lambda a: lax.all_gather(a, axis, axis=1, tiled=True), leaves))
+
+
+def add_up(pixels: Array) -> Array:
+    """How many pixels of the image are True, int32."""
+    axis, _, _ = _division(pixels)
+    count = pixels.sum(dtype=jnp.int32)
+    return count if axis is None else lax.psum(count, axis)
+
+
+def _together(send: Callable[[Array], Array], planes: list[Array]) -> list[Array]:
+    """`send` of planes `[P, H, W]`, all of one type in one go: each go costs what it takes to wait for the other devices."""
+    sent: dict[int, Array] = {}
+    for kind in dict.fromkeys(plane.dtype for plane in planes):
+        which = [i for i, plane in enumerate(planes) if plane.dtype == kind]
+        sent |= dict(zip(which, send(jnp.stack([planes[i] for i in which])), strict=True))
+    return [sent[i] for i in range(len(planes))]
+
+
+def _division(plane: Array) -> tuple[str | None, int, int]:
+    """The mesh axis over which rows are divided (None: they are not), how many devices it has, and the image's height."""
+    mesh = jax.sharding.get_abstract_mesh()
+    axis = next((name for name in mesh.manual_axes if str(name).startswith(DIVIDED)), None)
+    if axis is None:
+        return None, 1, plane.shape[0]
+    return axis, mesh.shape[axis], int(axis.removeprefix(DIVIDED))
 
 
 def split_rows(height: int, width: int, strip_rows: int) -> tuple[int, int]:
@@ -114,7 +192,7 @@ def sum_over_taps(
     count, rows = split_rows(height, width, strip_rows)
     below = count * rows - height
     unroll = len(offsets) if unroll_taps(height, width, len(offsets)) else 1
-    padded = jax.tree.map(lambda a: jnp.pad(a, ((top, top + below), (left, left))), neighbours)
+    padded = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), add_margin(neighbours, top, left))
     centred = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), (centre, where))
     corners = jnp.asarray(offsets) * jnp.asarray(step_size, jnp.int32) + jnp.array([[top, left]], jnp.int32)
 
@@ -168,13 +246,13 @@ def read_at(plane: Array, row: Array, column: Array) -> tuple[Array, Array]:
     """Read a plane at integer positions.
 
     Args:
-        plane: `[H, W]`.
+        plane: `[H, W]`, of `whole`.
         row, column: integer arrays of one shape; may lie outside.
 
     Returns:
         The values (of the nearest pixel inside, where outside) and a bool array: inside the image.
     """
-    height, width = plane.shape
+    (_, height), width = place(plane), plane.shape[1]
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
     index = jnp.clip(row, 0, height - 1) * width + jnp.clip(column, 0, width - 1)
     return plane.reshape(-1).at[index].get(mode="promise_in_bounds"), inside

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from svgf_jax.color import largest_luminance
+from svgf_jax.sampling import add_up
 from svgf_jax.types import Frame, Rejected
 
 _NOWHERE = 1e9  # a motion that points outside every image: no history
@@ -50,11 +51,11 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
         **_reflections(frame, surface),
     )
     rejected = Rejected(
-        radiance=_count(~radiance_finite.all(axis=(0, 3))),
-        negative=_count(~radiance_positive.all(axis=(0, 3))),
-        emission=_count(~emission_finite.all(axis=-1)),
-        surface=_count(was_surface & ~guided),
-        motion=_count(surface & ~traced),
+        radiance=add_up(~radiance_finite.all(axis=(0, 3))),
+        negative=add_up(~radiance_positive.all(axis=(0, 3))),
+        emission=add_up(~emission_finite.all(axis=-1)),
+        surface=add_up(was_surface & ~guided),
+        motion=add_up(surface & ~traced),
     )
     return repaired, rejected
 
@@ -80,7 +81,3 @@ def _known_variance(variance: Array) -> Array:
     """Kept so small that its division by the square of the least albedo floor, 2**-30, stays finite."""
     known = jnp.isfinite(variance) & (variance >= 0.0)
     return jnp.where(known, jnp.minimum(variance, largest_luminance(variance.dtype) ** 2 / 2.0**60), -1.0)
-
-
-def _count(pixels: Array) -> Array:
-    return pixels.sum(dtype=jnp.int32)

@@ -17,7 +17,7 @@ import numpy as np
 
 from svgf_jax import __version__, checkpoint, exr, frames, outputs, preview, tonemapping
 from svgf_jax.checkpoint import Checkpoint
-from svgf_jax.compiled import Filters, Pipeline, compile_filters, to_host
+from svgf_jax.compiled import Filters, Pipeline, check_devices, compile_filters, to_host
 from svgf_jax.methods import MethodConfig
 from svgf_jax.outputs import WriteOptions
 from svgf_jax.plan import Files, Plan, begin, make_plan, stamp, written
@@ -98,6 +98,7 @@ def run(
     resume: bool = False,
     overwrite: bool = False,
     device: str | None = None,
+    devices: int = 1,
     checkpoint_every: int = 8,
     threads: int | None = None,
     on_frame: Callable[[FrameReport], None] = lambda report: None,
@@ -120,6 +121,7 @@ def run(
         resume: continue an interrupted run; begin one where there is none. Excludes `overwrite`.
         overwrite: replace outputs that exist; without it they are an error.
         device: "cpu", "gpu", "gpu:1", ...; None takes JAX's default.
+        devices: divide the rows of each frame over so many devices of that kind.
         threads: frames read ahead, and outputs written behind; None = 2, or 1 where frames are so large that memory counts.
         on_frame: called in this thread for each frame once its output is complete, in order.
         on_output: called in a background thread with each filtered frame and its output, NumPy arrays, before that is written;
@@ -136,6 +138,7 @@ def run(
     threads = (1 if _pixels(source) > MANY_PIXELS else 2) if threads is None else threads
     if checkpoint_every < 1 or threads < 1:
         raise SvgfError(f"Got checkpoint_every {checkpoint_every} and threads {threads}; wanted at least 1 of each.")
+    check_devices(config, device, devices)
     plan, provenance = prepare(
         source, out, params=params, config=config, method=method, preset=preset, options=options, video=video, fps=fps
     )
@@ -159,7 +162,8 @@ def run(
 
     def filters() -> Filters:
         leave_out = _NEVER_READ if options.diagnostics or on_output else _NEVER_READ + _DIAGNOSTICS
-        made = compile_filters(params, config, device=device, pipeline=pipeline, leave_out=leave_out)
+        options_of = {"device": device, "devices": devices, "pipeline": pipeline, "leave_out": leave_out}
+        made = compile_filters(params, config, **options_of)
         device_name.append(made.device)
         return made
 

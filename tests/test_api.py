@@ -18,7 +18,7 @@ def test_the_public_names_are_these():
     assert set(svgf_jax.__all__) == {
         *("Config", "Frame", "History", "Output", "Params", "Rejected", "Reprojected", "SvgfError"),
         *("Accumulated", "Guides", "guides_of", "depth_gradient"),
-        *("init", "step", "denoise", "taa", "taa_init", "TaaHistory"),
+        *("init", "step", "step_over", "denoise", "taa", "taa_init", "TaaHistory"),
         *("baseline_init", "baseline_step", "baseline_denoise"),
         *("method", "MethodConfig"),
         *("Reflections", "trace_reflections"),

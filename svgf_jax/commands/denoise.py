@@ -54,6 +54,7 @@ def denoise(
     set_: Annotated[tuple[str, ...], Repeated, Parameter(name="--set", metavar="NAME=VALUE", group=FILTER)] = (),
     taa: Annotated[bool, Flag, Parameter(group=FILTER)] = False,
     device: Annotated[str | None, Parameter(metavar="DEVICE", group=FILTER)] = None,
+    devices: Annotated[int, Parameter(metavar="N", group=FILTER)] = 1,
     float_: Annotated[bool, Flag, Parameter(name="--float", group=OUTPUT)] = False,
     compression: Annotated[Compression, Parameter(group=OUTPUT)] = "zip",
     only_denoised: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
@@ -95,6 +96,7 @@ def denoise(
         set_: One parameter, or one value per a-trous level: sigma_normal=64, sigma_luminance=4,3,2,1,1. Repeatable.
         taa: Temporal anti-aliasing of the result; the same as --set taa=true. Of svgf only.
         device: cpu, gpu, gpu:1, ...; what JAX chooses if not given.
+        devices: Divide the rows of each frame over so many devices of that kind.
         float_: Write 32-bit float instead of 16-bit.
         compression: EXR compression of the output.
         only_denoised: Leave out the input's other layers and header attributes.
@@ -195,6 +197,7 @@ def denoise(
             resume=resume,
             overwrite=overwrite,
             device=device,
+            devices=devices,
             checkpoint_every=checkpoint_every,
             on_frame=on_frame,
             stop=lambda: bool(interruption),
