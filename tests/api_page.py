@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "svgf_jax" / "docs" / "api.md"
 GROUPS = {
     "svgf_jax": {
-        "The filter": ["pipeline", "types", "parameters"],
+        "The filter": ["pipeline", "devices", "types", "parameters"],
         "Its stages": [
             *("sanitation", "color", "outliers", "reprojection", "reflections", "accumulation", "variance"),
             *("edges", "atrous", "modulation", "antialiasing"),
