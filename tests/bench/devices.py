@@ -1,7 +1,7 @@
 """One frame over several CPU devices.
 
 JAX_NUM_CPU_DEVICES=4 python tests/bench/devices.py check      every preset over 2, 3 and 4 devices, with derivatives
-JAX_NUM_CPU_DEVICES=2 python tests/bench/devices.py scaling    seconds a frame over 1 and 2 devices, interleaved
+JAX_NUM_CPU_DEVICES=2 python tests/bench/devices.py scaling [1920x1080]    seconds a frame, interleaved
 """
 
 import sys
@@ -43,17 +43,18 @@ def derivative(name):
     return over_devices.difference(*(jax.jvp(partial(image, go), given, given)[1] for go in functions))
 
 
-def scaling():
-    """Strong: a picture of 1920 x 1080 over 1 and 2 devices. Weak: half of it over 1."""
+def scaling(size="1920x1080"):
+    """Strong: a picture over 1 and 2 devices. Weak: half of it over 1."""
+    width, height = map(int, size.split("x"))
     params, config = preset("paper")
-    cases = {"1 device": (1080, 1), "2 devices": (1080, 2), "1 device, half the picture": (540, 1)}
+    cases = {"1 device": (height, 1), "2 devices": (height, 2), "1 device, half the picture": (height // 2, 1)}
     runs = {}
-    for name, (height, count) in cases.items():
-        frame = to_frame(scenes.synthetic(3, height, 1920, frames=1)[0], np.float32)
+    for name, (rows, count) in cases.items():
+        frame = to_frame(scenes.synthetic(3, rows, width, frames=1)[0], np.float32)
         go = partial(step_over, devices=jax.devices()[:count], params=params, config=config)
         history, _ = go(init(frame), frame)
         runs[name] = (go, history, frame, [])
-    for _ in range(7):
+    for _ in range(9):
         for go, history, frame, seconds in runs.values():
             began = time.perf_counter()
             jax.block_until_ready(go(history, frame))
@@ -63,4 +64,4 @@ def scaling():
 
 
 if __name__ == "__main__":
-    {"check": check, "scaling": scaling}[sys.argv[1]]()
+    {"check": check, "scaling": scaling}[sys.argv[1]](*sys.argv[2:])
