@@ -29,7 +29,7 @@ class Estimate(NamedTuple):
 
 def estimate(scan: Scan, *, pixels: int, signals: int, config: Any, options: WriteOptions = WriteOptions()) -> Estimate:
     """Estimate a run over frames of so many `pixels` and `signals`; `config` is that of the filter."""
-    levels = getattr(config, "levels", 5)
+    levels = getattr(config, "levels", None) or 5  # other methods leave it open
     seconds = pixels * (SECONDS + SECONDS_A_LEVEL * signals * (levels + 2))
     memory = BASE_MEMORY + pixels * (MEMORY + MEMORY_A_SIGNAL * signals)
     return Estimate(seconds, memory, _disk(scan, pixels, signals, options))

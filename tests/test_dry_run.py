@@ -10,8 +10,11 @@ from shots import SIZE, write_frame, write_shot
 from svgf_jax import exr
 from svgf_jax.cli import main
 from svgf_jax.commands import terminal
+from svgf_jax.estimates import estimate
 from svgf_jax.frames import open_source
+from svgf_jax.methods import METHODS, override_method
 from svgf_jax.scan import samples_per_pixel, scan_files
+from svgf_jax.types import Config
 
 
 def run(capsys, *arguments):
@@ -42,6 +45,17 @@ def test_a_dry_run_tells_everything_and_writes_nothing(shot, tmp_path, capsys):
     assert told["frames"] == 3
     assert told["disk"] > 3 * SIZE[0] * SIZE[1] * 6
     assert told["preset"] == "paper"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_dry_run_knows_every_method(shot, tmp_path, capsys, method):
+    scan = scan_files(open_source(shot))
+    config = Config() if method == "svgf" else override_method(method, {})[1]
+    assert 0 < estimate(scan, pixels=1000, signals=2, config=config).seconds < 1
+    if method == "accumulate":
+        code, _, error = run(capsys, "denoise", shot, "-o", tmp_path / "out", "--dry-run", "--method", method)
+        assert code == 0, error
+        assert "nothing was written" in error
 
 
 @pytest.mark.parametrize(
