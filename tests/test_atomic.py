@@ -3,6 +3,8 @@ import os
 import pytest
 
 from svgf_jax import atomic
+from svgf_jax.commands.results import require_writable, save
+from svgf_jax.types import SvgfError
 
 
 def names(folder):
@@ -52,3 +54,14 @@ def test_what_cannot_be_written_is_known_before(tmp_path):
         with pytest.raises(FileNotFoundError):
             do(tmp_path / "nowhere" / "a.txt")
     assert names(tmp_path) == []
+
+
+def test_the_folders_of_a_result_are_made_when_it_is_written(tmp_path):
+    page = tmp_path / "clean" / "today" / "report.html"
+    require_writable((page, None), overwrite=False)
+    assert list(tmp_path.iterdir()) == []
+    save(page, "text")
+    assert [path.name for path in page.parent.iterdir()] == ["report.html"]
+    for path in (page, page / "a.html", page / "a" / "b.html"):
+        with pytest.raises(SvgfError, match="exists already|Could not write"):
+            require_writable((path,), overwrite=False)

@@ -114,7 +114,7 @@ ERRORS = {
     "negative exposure": (["denoise", "good", "-o", "out", "--exposure", "-1"], "above 0"),
     "no exposure": (["denoise", "good", "-o", "out", "--png", "--exposure", "nan"], "above 0"),
     "nothing to compare": (["compare", "god", "good"], "good"),
-    "scores into nowhere": (["compare", "good", "good", "--csv", "no/a.csv"], "Could not write no/a.csv: No such file"),
+    "scores into nowhere": (["compare", "good", "good", "--csv", "file/a.csv"], "Could not write file/a.csv: Not a"),
     "scores over a folder": (["compare", "good", "good", "--json", "nothing", "--overwrite"], "Is a directory"),
     "different sizes": (["compare", "resized", "good"], "pixels"),
     "unknown shown preset": (["params", "show", "papr"], "paper"),

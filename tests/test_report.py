@@ -245,7 +245,7 @@ def stand_in(history, frame, params):
         (["denoise", "in", "-o", "out", "--reference", "ref"], "--reference ref without --report"),
         (["compare", "out", "ref", "--before", "in"], "--before in without --report"),
         (["denoise", "in", "-o", "out", "--report", "there.html"], "there.html exists already"),
-        (["compare", "out", "ref", "--report", "no/page.html"], "Could not write no/page.html"),
+        (["compare", "out", "ref", "--report", "there.html/page.html"], "Could not write there.html/page"),
     ],
 )
 def test_what_cannot_be_is_said_before_the_work(arguments, complaint, tmp_path, monkeypatch, capsys):

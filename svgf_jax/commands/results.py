@@ -8,21 +8,26 @@ from svgf_jax.types import SvgfError
 
 
 def require_writable(paths: Iterable[Path | None], *, overwrite: bool) -> None:
-    """Raise SvgfError where a file exists and may not be replaced, or could not be written; None is no file."""
+    """Raise SvgfError where a file exists and may not be replaced, or could not be written; None is no file.
+
+    Folders that are missing will be made: then the nearest one above must be writable.
+    """
     for path in paths:
         if path is None:
             continue
         if path.exists() and not overwrite:
             raise SvgfError(f"{path} exists already; choose another name, or --overwrite.")
+        folder = next(above for above in path.absolute().parents if above.exists())
         try:
-            atomic.require_writable(path)
+            atomic.require_writable(path if path.parent.exists() else folder / path.name)
         except OSError as error:
             raise _not_written(path, error) from error
 
 
 def save(path: Path, text: str) -> None:
-    """Write a file, or raise SvgfError and leave it as it was."""
+    """Write a file, and the folders for it; or raise SvgfError and leave it as it was."""
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         atomic.write_text(path, text)
     except OSError as error:
         raise _not_written(path, error) from error
