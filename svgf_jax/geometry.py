@@ -129,7 +129,7 @@ def depth_by_planes(
 
 
 def continuity(previous: Frame, current: Frame, *, params: Params = Params(), most: int = 200_000) -> Continuity:
-    """Apply the filter's tests of reprojection (DESIGN: the previous pixel shows the same surface) to about `most` pixels."""
+    """Apply the filter's tests of reprojection (whether the previous pixel shows the same surface) to about `most` pixels."""
     surface = current.object_id != -1
     y, x = np.nonzero(surface)
     if not len(x):
