@@ -12,6 +12,7 @@ from svgf_jax.motion import Convention
 from svgf_jax.remedies import remedy
 from svgf_jax.roles import WIDTH
 from svgf_jax.sequences import format_range
+from svgf_jax.warping import NEAR, Residual, off
 
 CORRELATED = 0.15
 """Correlation of neighbours' noise from which on it matters: Mitsuba's default filter has 0.37, independent pixels 0."""
@@ -41,7 +42,7 @@ def judge(facts: Facts, *, gaps_allowed: bool = True) -> tuple[Finding, ...]:
     """All findings, errors first. Without `gaps_allowed`, missing frames are an error."""
     renderer = facts.table.name
     found = [*_files(facts, gaps_allowed), *_roles(facts), *_light(facts, renderer), *_guides(facts, renderer)]
-    found += [*_motion(facts), *_history(facts, renderer)]
+    found += [*_motion(facts, renderer), *_history(facts, renderer)]
     return tuple(sorted(found, key=lambda one: ("error", "warning", "note").index(one.level)))
 
 
@@ -200,16 +201,23 @@ def _depth(fit: Fit, renderer: str) -> Iterator[Finding]:
         yield Finding("warning", "depth", text, remedy("depth kind", renderer))
 
 
-def _motion(facts: Facts) -> Iterator[Finding]:
+def _motion(facts: Facts, renderer: str) -> Iterator[Finding]:
     if facts.motion is None:
+        if facts.warped is not None and off(facts.warped):
+            yield _as_read(facts.warped)
         return
     fits, residuals = facts.motion.fits, facts.motion.residuals
     if not fits:
+        judged = any(one.judged for one in residuals.values())
+        moves, vectors = judged and _off(facts, None) > NEAR, residuals.keys() != {None}
+        if moves and not vectors:
+            text = f"motion vectors are all 0, though the scene moves: {_off(facts, None):.2g} pixels off."
+            yield Finding("warning", "motion", text, remedy("zero motion", renderer))
+            return
         still = facts.continuity is not None and facts.continuity.still > 0.98
-        if still or not any(one.judged for one in residuals.values()):
-            yield Finding(
-                "note", "motion", "nothing moves: the motion convention cannot be told, and does not matter.", ""
-            )
+        if not judged or not vectors or (still and not moves):
+            text = "nothing moves: the motion convention cannot be told, and does not matter."
+            yield Finding("note", "motion", text, "")
             return
         best = min(_off(facts, one) for one in residuals if one is not None)
         text = (
@@ -228,9 +236,17 @@ def _motion(facts: Facts) -> Iterator[Finding]:
         read = " or ".join(f"'{one}'" for one in fits)
         text = f"motion vectors follow {read} ({_off(facts, fits[0]):.2g} pixels off), not '{own}' ({_off(facts, own):.2g})."
         yield Finding("warning", "motion", text, f"Say so: --motion '{fits[0]}'.")
+    elif facts.warped is not None and off(facts.warped):  # of the pair that is worse off
+        yield _as_read(facts.warped)
     elif len(fits) > 1:
         others = ", ".join(f"'{one}'" for one in fits if one != own)
         yield Finding("note", "motion", f"motion could as well be {others}: these frames do not tell.", "")
+
+
+def _as_read(warped: Residual) -> Finding:
+    text = f"motion leads past the same point of the frame before: {warped.pixels:.2g} pixels off, by position."
+    change = "Look at the channels of motion and at cameras.json: of another frame, of another size, or smoothed?"
+    return Finding("warning", "motion", text, change)
 
 
 def _off(facts: Facts, one: Convention | None) -> float:

@@ -56,8 +56,9 @@ REMEDIES: dict[str, dict[str, str]] = {
     "broken guides": {
         "": "Such pixels count as background, or have no history; look at the objects there.",
     },
-    "still": {
-        "": "Nothing to mend: where nothing moves, all conventions are the same.",
+    "zero motion": {
+        "": "Let the renderer fill them (often not with motion blur); with positions and a cameras.json they are not needed.",
+        "cycles": "Turn off Render > Motion Blur: with it, Cycles writes 0 into the pass Vector.",
     },
     "guides": {
         "": "They count as background. Depth in half float is infinite above 65504: write 32-bit, or scale the scene.",

@@ -46,7 +46,7 @@ class Verdict(NamedTuple):
     """Which conventions fit.
 
     Attributes:
-        residuals: by convention, the best first; `None` is no motion at all.
+        residuals: by convention, the best first; `None` is no motion at all, and alone where all vectors are 0.
         fits: those that fit as well as the best. One: that is it. Several: the frames do not tell them apart. None:
             nothing fits, or no motion at all fits as well.
     """
@@ -57,6 +57,12 @@ class Verdict(NamedTuple):
 
 FARTHEST = 4.0
 """Pixels beyond which being wrong is not told apart any more."""
+
+NEAR = 1.0
+"""Pixels that motion may be off, by position: noise in the guides and jitter of the camera make about half of that."""
+
+NOTHING = 1e-5
+"""Vectors no longer than this are 0 but for rounding, whatever their unit."""
 
 FEWEST, MOST = 16, 8192
 """Pixels from which on there is something to judge by; so many do."""
@@ -85,21 +91,22 @@ def find_convention(steps: Sequence[Step], *, size: tuple[int, int] | None = Non
     """Which of `CONVENTIONS` the motion vectors of a few pairs of frames follow.
 
     Conventions fit as well as the best if their residual is within 10 % (and a hundredth of a pixel) of its. The best fits
-    only if it is below 0.8 of the residual of no motion at all. The pixels that count are those that move by at least a
-    tenth of what the fast ones do.
+    only if it is below 0.8 of the residual of no motion at all, and by position within `NEAR`. The pixels that count are those
+    that move by at least a tenth of what the fast ones do; without any vector, all that show a surface.
 
     Args:
         steps: pairs of frames; some three from different places of a sequence do.
         size: width and height of the whole picture, if the arrays are crops.
     """
     before = all(step.stored_before is not None for step in steps)
-    candidates = [None, *(one for one in CONVENTIONS if before or not one.from_frame_before)]
+    lengths = [_length(_finite(step.stored[..., :2])) for step in steps]
+    surfaces = [np.asarray(step.current.object_id) != -1 for step in steps]
+    told = any((length[surface] > NOTHING).any() for length, surface in zip(lengths, surfaces, strict=True))
+    candidates = [None, *(one for one in CONVENTIONS if told and (before or not one.from_frame_before))]
     judged: dict[Convention | None, list[Residual]] = {one: [] for one in candidates}
-    for step in steps:
-        length = _length(_finite(step.stored[..., :2]))
-        surface = np.asarray(step.current.object_id) != -1
+    for step, length, surface in zip(steps, lengths, surfaces, strict=True):
         fast = np.quantile(length[surface], 0.98) if surface.any() else 0.0
-        scene = _scene(step.previous, step.current, length > 0.1 * fast)
+        scene = _scene(step.previous, step.current, length > 0.1 * fast if told else surface)
         for one in candidates:
             if one is None:
                 motion = np.zeros((*surface.shape, 2), np.float32)
@@ -109,10 +116,15 @@ def find_convention(steps: Sequence[Step], *, size: tuple[int, int] | None = Non
     means = {one: _mean(residuals) for one, residuals in judged.items()}
     ranked = dict(sorted(means.items(), key=lambda item: np.nan_to_num(item[1].pixels, nan=np.inf)))
     named = {one: residual.pixels for one, residual in ranked.items() if one is not None}
-    best, still = min(named.values(), key=lambda value: np.nan_to_num(value, nan=np.inf)), means[None].pixels
-    if not best < 0.8 * still:
+    best, still = next(iter(named.values()), np.nan), means[None].pixels
+    if not best < 0.8 * still or any(off(one) for one in ranked.values() if one.pixels == best):
         return Verdict(ranked, ())
     return Verdict(ranked, tuple(one for one, value in named.items() if value <= 1.1 * best + 0.01))
+
+
+def off(residual: Residual) -> bool:
+    """Whether motion is further off than noise and jitter explain; told by positions alone, which nothing hides."""
+    return residual.guides == ("position",) and residual.pixels > NEAR
 
 
 def _mean(residuals: Sequence[Residual]) -> Residual:
