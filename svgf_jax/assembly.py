@@ -16,7 +16,7 @@ from svgf_jax.cameras import (
 from svgf_jax.motion import convert, parse_convention
 from svgf_jax.planes import guides, in_world, light
 from svgf_jax.reflections import signals_reflected
-from svgf_jax.roles import Roles
+from svgf_jax.roles import Roles, short_names
 from svgf_jax.types import Frame, SvgfError
 
 IN_FRAME = " In frame "  # what follows it in a note are that frame's numbers
@@ -95,6 +95,12 @@ def assemble(
         notes.append(
             f"the light is more than its parts: what is in none of {', '.join(roles.signals)} stays unfiltered. Switch on "
             f"the passes that are missing.{IN_FRAME}{place.number}: {100 * counts['rest'] / object_id.size:.3g} % of the pixels."
+        )
+    if changed := counts.get("changed", 0):
+        notes.append(
+            f"{short_names(roles.layers['radiance'].channels)} is not the sum of its parts, more here and less there: denoised, or "
+            "changed by the compositor. It is left out, and the sum taken. Render without a denoiser, or with the noisy picture "
+            f"beside it.{IN_FRAME}{place.number}: {100 * changed / object_id.size:.3g} % of the pixels."
         )
     measured = [planes[f"{role}_variance"][..., 0] for role in roles.signals if f"{role}_variance" in planes]
     variance = np.stack(measured) if measured else None

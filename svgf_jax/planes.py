@@ -11,6 +11,9 @@ from svgf_jax.roles import REST, Roles
 FAR = 1e8
 """Depths from here on are the renderers' way of saying that nothing was hit."""
 
+CHANGED = 0.02
+"""Share of the pixels that a beauty may be off its parts both ways: a denoised one is in nearly all."""
+
 
 def light(
     roles: Roles, planes: dict[str, np.ndarray], counts: dict[str, int]
@@ -20,7 +23,8 @@ def light(
     Light that is already divided by its albedo is multiplied by it: a signal is reflected radiance, and demodulation gives the
     file's numbers back wherever the albedo is above its floor. (So no other file of this library needs to know.) From a beauty,
     which contains it, the emission is taken off. What a beauty has beyond the kinds of light that are there is a signal of its own
-    (`rest`), or where none is expected, stays unfiltered with the emission and is counted.
+    (`rest`), or where none is expected, stays unfiltered with the emission and is counted. A beauty that is more than its parts
+    here and less there, in more than `CHANGED` of the pixels each, was changed after it was rendered: it is left out, and counted.
     """
     emitted = [planes[role] for role in ("emission", "environment") if role in planes]
     shape = next(iter(planes.values())).shape[:2]
@@ -37,6 +41,10 @@ def light(
         parts = sum(signals, emission)
         rest = planes["radiance"] - parts
         rest = np.where(np.abs(rest) > 0.01 * np.maximum(np.abs(parts), planes["radiance"]), rest, 0)
+        more, less = ((one > 0).any(-1) for one in (rest, -rest))
+        if min(more.mean(), less.mean()) > CHANGED:
+            counts["changed"] = int((more | less).sum())
+            rest = np.zeros_like(rest)
         if REST in roles.signals:
             signals.append(np.maximum(rest, 0))
         else:

@@ -200,7 +200,7 @@ def test_a_terminal_gets_a_progress_bar(shots, tmp_path):
 
 
 def test_every_count_is_told_in_words():
-    read = {"excess", "guides", "normal"}
+    read = {"excess", "rest", "changed", "guides", "normal"}
     assert terminal.REPAIRS.keys() == read | set(Rejected._fields) | {"clipped", "not_finite"}
     assert terminal.repairs({"negative": 1, "radiance": 2}) == [
         "1 pixel with negative radiance: set to 0",

@@ -1,9 +1,11 @@
 """Channel names to roles: found, given by hand, absent, wrong."""
 
+import numpy as np
 import pytest
 
 from svgf_jax import SvgfError
-from svgf_jax.roles import WIDTH, check_channels, resolve_roles
+from svgf_jax.assembly import Place, assemble
+from svgf_jax.roles import WIDTH, Layer, Light, Roles, check_channels, resolve_roles
 
 
 def rgb(*names):
@@ -143,3 +145,25 @@ def test_a_later_frame_without_a_channel():
         SvgfError, match=r"f7\.exr: no channel 'albedo\.R', which is albedo in the frames before\. Closest"
     ):
         check_channels(layer, rgb("direct", "albed"), where="f7.exr", role="albedo")
+
+
+@pytest.mark.parametrize("signals", [("direct", "indirect"), ("direct", "indirect", "rest")])
+@pytest.mark.parametrize("share", [0.005, 1.0])
+def test_a_denoised_beauty_is_left_out(signals, share):
+    rng = np.random.default_rng(0)
+    parts = {role: rng.gamma(1.0, 1.0, (20, 20, 3)).astype(np.float32) for role in ("direct", "indirect")}
+    total = parts["direct"] + parts["indirect"]
+    denoised = np.where(rng.random((20, 20, 1)) < share, total.mean((0, 1)), total).astype(np.float32)
+    layers = {role: Layer((role,), False, "") for role in (*parts, "radiance")}
+    roles = Roles(layers, {}, signals, {role: Light("", False) for role in signals})
+    planes = parts | {"radiance": denoised}
+    place = Place(1, None, (0, 0), (20, 20), None)
+    frame, counts, notes = assemble(roles, planes, place, motion_before=lambda: None)
+    if share == 1:
+        assert counts["changed"] > 300
+        assert "radiance is not the sum of its parts" in notes[0]
+        assert (frame.radiance.sum(0) == total).all()
+        assert not frame.emission.any()
+    else:
+        assert "changed" not in counts
+        assert notes == ()

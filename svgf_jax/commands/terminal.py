@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 REPAIRS = {
     "excess": "with more emission than the radiance that contains it: the rest taken as 0",
+    "rest": "with more light than its parts: what is in none of them stays unfiltered",
+    "changed": "with a picture that is not the sum of its parts: the sum taken",
     "guides": "hit, but without a usable depth or normal: taken as background",
     "normal": "with a normal not of unit length: brought to it",
     "radiance": "with non-finite radiance: set to 0",
