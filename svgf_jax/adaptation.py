@@ -12,8 +12,8 @@ new light at once.
 
 s in [0, 1) is how significant the difference d of the mean luminances is against its own standard error e:
 s = max(0, 1 - (threshold e / d)^4), where e^2 is the variance of the samples' differences inside the neighbourhood over the
-effective number of them. A single firefly among n pixels makes d and e equally large, so it is never significant. Nor is it
-when there happens to be none: the variance is at least the one that the history remembers.
+effective number of them. A single firefly makes d and e large together: it is never significant at thresholds of 1.4 and more.
+Nor is it when there happens to be none: the variance is at least the one that the history remembers.
 
 Then, per pixel, from the four cells around it (bilinear, geometry weights): H' = max(0, g H + o), and the moments move with it:
 M1' = g M1 + o; the variance M2 - M1^2 scales with the square of the light and turns, as s rises, into the one just observed.
@@ -37,6 +37,7 @@ GAIN_LEVELS = 3  # a-trous levels on the grid of cells: reach of +-14 cells
 OFFSET_LEVELS = 1  # +-2 cells
 LARGEST_GAIN = 50.0
 _OFFSETS = square_offsets(2)
+_B3 = np.array([1, 4, 6, 4, 1]) / 16.0  # the B3 spline
 _DARK = 1e-6  # mean luminance below which a ratio means nothing
 _TINY = 1e-12
 
@@ -260,7 +261,8 @@ def _correct_sums(sums: tuple[Sums, ...], corrections: tuple[Correction, ...]) -
 
 def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, scalars: Params):
     """1 / (effective number of pixels) of ever wider neighbourhoods of cells, and the means over them."""
-    kernel = np.outer([1, 4, 6, 4, 1], [1, 4, 6, 4, 1]).reshape(-1) / 256.0
+    kernel = np.outer(_B3, _B3).reshape(-1)
+    shared = shared_paths(levels)
     away = jnp.asarray(_OFFSETS * size, cells.weight.dtype)
 
     def tap(sums, q, p, t):
@@ -292,10 +294,23 @@ def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, s
     def means(weight: Array, square: Array, totals):
         some = weight > _TINY
         divisor = jnp.where(some, weight, 1.0)
-        effective = jnp.where(some, square / divisor / divisor, 1.0)
+        effective = jnp.where(some, jnp.minimum(shared * square / divisor / divisor, 1.0), 1.0)
         return effective, jax.tree.map(lambda t: jnp.where(some, t / divisor, 0.0), totals)
 
     return in_strips(means, *state)
+
+
+def shared_paths(levels: int) -> float:
+    """How much larger the variance of a mean over a-trous levels is than the sum of its paths' squared weights, on a plain surface.
+
+    The same cell is reached along several paths, whose errors are one: (sum of the paths)^2 > sum of their squares.
+    """
+    whole = np.ones(1)
+    for i in range(levels):
+        spread = np.zeros(4 * 2**i + 1)
+        spread[:: 2**i] = _B3
+        whole = np.convolve(whole, spread)
+    return float(((whole**2).sum() / (_B3**2).sum() ** levels) ** 2)  # squared: rows and columns
 
 
 def _significance(
@@ -343,7 +358,7 @@ def _apply(cells: Cells, corrections, guides, slope, known, history, moments, *,
 
         zero = jnp.zeros((rows, columns), known.dtype)
         sums = (zero, jax.tree.map(lambda _: zero, corrections))
-        (weight, totals), _ = lax.scan(add, sums, (corner, shares, away))
+        (weight, totals), _ = lax.scan(add, sums, (corner, shares, away), unroll=len(corners))
         found = (weight > 1e-8) & (with_history > 0.0)
         divisor = jnp.where(found, weight, 1.0)
         corrected = [_correct(c, m, t, divisor) for c, m, t in zip(colors, pairs, totals, strict=True)]

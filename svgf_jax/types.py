@@ -177,9 +177,9 @@ class Params(NamedTuple):
         kernel_near: a-trous tap at distance 1 relative to the centre tap (B3 spline: 2/3), >= 0.
         kernel_far: a-trous tap at distance 2 relative to the centre tap (B3 spline: 1/6), >= 0.
         light_gain_threshold: standard errors by which the light over a wide neighbourhood must differ from the history's
-            before the history is scaled to it, > 0. This and the next two are read only where `light_cell` > 0.
-        light_offset_threshold: the same over a narrow neighbourhood, before the rest of the difference is added, > 0.
-        light_sigma_normal: normal edge-stopping of these neighbourhoods, exponent of the cosine, > 0.
+            before the history is scaled to it, >= 0. This and the next two are read only where `light_cell` > 0.
+        light_offset_threshold: the same over a narrow neighbourhood, before the rest of the difference is added, >= 0.
+        light_sigma_normal: normal edge-stopping of these neighbourhoods, exponent of the cosine, >= 0.
         initial_variance: the variance of a pixel without history, >= 0. This and the next are read only where `variance` is
             "temporal".
         variance_scale: factor on the temporal variance, >= 0.
