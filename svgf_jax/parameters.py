@@ -18,7 +18,7 @@ A parameter file is TOML:
 import difflib
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -121,9 +121,7 @@ def load_params(path: str | os.PathLike[str]) -> tuple[Params, Config]:
             try:
                 if key not in names:
                     hint = f"; it belongs into [{other}]" if key in (*Params._fields, *Config._fields) else ""
-                    raise SvgfError(
-                        f"no {key!r} in [{table}]{hint or suggest(key, names)}. There are {', '.join(names)}"
-                    )
+                    raise SvgfError(f"no {key!r} in [{table}]{sentences(hint or suggest(key, names), names)}")
                 levels = _choice(key, value) if key == "levels" else levels
                 _choice(key, value) if table == "config" else _number(key, value, levels)
             except SvgfError as error:
@@ -138,7 +136,7 @@ def _check_keys(file: TomlFile) -> None:
     known = ("schema", "preset", "params", "config", "provenance")
     for key, value in file.content.items():
         if key not in known:
-            raise SvgfError(f"{place(file, key)}: unknown key {key!r}{suggest(key, known)}; wanted {', '.join(known)}")
+            raise SvgfError(f"{place(file, key)}: unknown key {key!r}; wanted {', '.join(known)}{suggest(key, known)}")
         if key in known[2:] and not isinstance(value, dict):
             raise SvgfError(f"{place(file, key)}: {key} is {value!r}; wanted a table, [{key}]")
     if type(schema := file.content.get("schema", SCHEMA)) is not int or schema != SCHEMA:
@@ -227,6 +225,11 @@ def _plain(value: Any) -> Any:
     """A float, or a list of floats, out of whatever array a parameter is held in."""
     value = value.tolist() if hasattr(value, "tolist") else value
     return [float(v) for v in value] if isinstance(value, list | tuple) else float(value)
+
+
+def sentences(hint: str, known: Iterable[str]) -> str:
+    """The end of an error message: what `suggest` says or another hint, then all that there is."""
+    return f"{hint}{'' if hint.endswith('?') else '.'} There are {', '.join(known)}."
 
 
 def suggest(name: Any, known: Any) -> str:

@@ -122,15 +122,16 @@ class Roles(NamedTuple):
 
     def describe(self, *, absent: bool = True) -> str:
         """The mapping in one line a role, for people; `absent`: with those that are not there."""
-        lines = []
+        told: dict[str, str] = {}
         for role, layer in self.layers.items():
             if role.removesuffix("_albedo") in self.light and role.endswith("_albedo"):
                 continue  # stands in its light's line
             by = self.layers.get(f"{role}_albedo") if role in self.light else None
             names = short_names(layer.channels) + (f", albedo {short_names(by.channels)}" if by else "")
-            lines.append(f"{role:9} {names} ({layer.reason}{'; ' if layer.meaning else ''}{layer.meaning})")
-        lines += [f"{role:9} not there, taken as {default}" for role, default in self.absent.items() if absent]
-        return "\n".join(lines)
+            told[role] = f"{names} ({layer.reason}{'; ' if layer.meaning else ''}{layer.meaning})"
+        told |= {role: without(default) for role, default in self.absent.items() if absent}
+        width = max(map(len, told))
+        return "\n".join(f"{role:{width}}  {text}" for role, text in told.items())
 
 
 def resolve_roles(
@@ -196,6 +197,11 @@ def resolve_roles(
     if any(f"{role}_albedo" in layers for role in signals):
         absent.pop("albedo", None)
     return Roles(layers, absent, signals, light, table.name)
+
+
+def without(default: str) -> str:
+    """What is told of a role that is absent: what stands in for it, or what else says it (`cameras.json says`)."""
+    return f"not there{':' if default.endswith((' say', ' says')) else ', taken as'} {default}"
 
 
 def short_names(names: tuple[str, ...]) -> str:

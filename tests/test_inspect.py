@@ -12,6 +12,7 @@ from rooms import SIZE, camera, write_room
 from test_dry_run import run
 
 from svgf_jax import exr, sample
+from svgf_jax.commands.inspect import _sentence
 from svgf_jax.findings import Finding, judge, verdict
 from svgf_jax.frames import open_source
 from svgf_jax.inspection import inspect_source
@@ -327,6 +328,14 @@ def test_every_remedy_says_something_to_do():
         for renderer, text in by_renderer.items():
             assert re.fullmatch(r"\S.*[.)]", text), (topic, renderer)
             assert remedy(topic, renderer) == text
+
+
+def test_a_sentence_begins_with_a_capital_letter_but_a_path_does_not():
+    for text in ("gaps/frame_0001.exr: cut off", "my shots/a.exr: cut off", "room.0001.exr: cut off"):
+        assert _sentence(text) == text
+    assert _sentence("frames 3 are missing.") == "Frames 3 are missing."
+    assert _sentence("no albedo: taken as 1.") == "No albedo: taken as 1."
+    assert _sentence("fast: 1/2") == "Fast: 1/2"
 
 
 def test_a_verdict_counts():

@@ -46,7 +46,7 @@ def test_a_file_may_build_on_a_preset(tmp_path):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("[params]\nalhpa = 0.5", "p.toml:2: no 'alhpa' in [params]. Did you mean alpha?"),
+        ("[params]\nalhpa = 0.5", "p.toml:2: no 'alhpa' in [params]. Did you mean alpha? There are alpha, alpha_m"),
         ("[params]\nlevels = 4", "p.toml:2: no 'levels' in [params]; it belongs into [config]"),
         ("# note\n\n[params]\nsigma_luminance = [\n1,2,\n3,4,5]\n# two\nalpha = 1.5 # here", "p.toml:8: alpha = 1.5"),
         ("preset = 'tuned'\n[config]\nlevels = 4", "p.toml:3: sigma_normal has 5 values"),

@@ -70,7 +70,7 @@ def test_the_nearest_file_above_is_taken(tmp_path):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("[denoise]\n\npgn = true", "svgf-jax.toml:3: denoise has no option 'pgn'. Did you mean png?"),
+        ("[denoise]\n\npgn = true", "svgf-jax.toml:3: denoise has no option 'pgn'. Did you mean png? There are cam"),
         ("[denoise]\npng = 1", "svgf-jax.toml:2: png = 1; wanted true or false"),
         ("[denoise]\npreset = true", "svgf-jax.toml:2: preset = true; wanted one text or number"),
         ("[denoise]\npreset = ['a', 'b']", "svgf-jax.toml:2: preset = a,b; wanted one text or number"),

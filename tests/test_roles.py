@@ -51,6 +51,12 @@ def test_a_plain_beauty_is_one_signal_and_every_absence_says_what_it_costs():
     assert "albedo    not there, taken as 1: textures" in text
 
 
+def test_long_names_and_what_else_says_a_role_are_told_in_line():
+    layers = {"radiance": Layer(("R",), False, "x"), "glossy_indirect": Layer(("G",), False, "x")}
+    text = Roles(layers, {"motion": "cameras.json says"}, ("radiance",), {}).describe()
+    assert text == "radiance         R (x)\nglossy_indirect  G (x)\nmotion           not there: cameras.json says"
+
+
 def test_direct_alone_is_one_signal():
     assert resolve_roles(rgb("direct")).signals == ("direct",)
 

@@ -144,7 +144,7 @@ def _files(facts: "Facts") -> Iterator[tuple[str, str]]:
 
 
 def _channels(facts: "Facts") -> Iterator[tuple[str, str]]:
-    from svgf_jax.roles import short_names
+    from svgf_jax.roles import short_names, without
 
     roles = facts.roles
     yield "names", facts.table.title
@@ -156,7 +156,7 @@ def _channels(facts: "Facts") -> Iterator[tuple[str, str]]:
         meaning = f"; {layer.meaning}" if layer.meaning else ""
         yield role, f"{names}, {facts.scan.types.get(role, '')} ({layer.reason}{meaning})"
     for role, default in roles.absent.items():
-        yield role, f"not there{':' if default.endswith((' say', ' says')) else ', taken as'} {default}"
+        yield role, without(default)
     stems: dict[str, list[str]] = {}
     for name in facts.scan.unused:
         stems.setdefault(name.rpartition(".")[0], []).append(name)
@@ -252,7 +252,9 @@ def _motion(facts: "Facts") -> Iterator[tuple[str, str]]:
 
 
 def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
+    """With a capital letter, unless it begins with a path."""
+    path = "/" in text.partition(":")[0] or not text.partition(" ")[0].rstrip(",:;").isalpha()
+    return text if path else text[:1].upper() + text[1:]
 
 
 def _record(facts: "Facts") -> dict[str, Any]:

@@ -17,7 +17,7 @@ from cyclopts.argument import ArgumentCollection
 from cyclopts.token import Token
 
 from svgf_jax.commands import terminal
-from svgf_jax.parameters import suggest
+from svgf_jax.parameters import sentences, suggest
 from svgf_jax.toml import TomlFile, place, read_toml
 from svgf_jax.types import SvgfError
 
@@ -68,8 +68,8 @@ def _apply(
         where = place(file, *commands, name)
         if name not in options:
             raise SvgfError(
-                f"{where}: {' '.join(commands)} has no option {name!r}{suggest(name, options)}. "
-                f"There are {', '.join(sorted(options))}."
+                f"{where}: {' '.join(commands)} has no option {name!r}"
+                f"{sentences(suggest(name, options), sorted(options))}"
             )
         texts = _texts(name, value, options[name].hint, where)
         if name in given | hidden:
