@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import pytest
+from shots import write_shot
+from test_dry_run import run
 
 from svgf_jax import cli
 from svgf_jax.commands import denoise
@@ -56,6 +58,14 @@ def test_the_file_stands_behind_the_command_line(chosen, capsys):
     assert chosen(text, "--config", "none")["preset"] is None
     (Path.cwd() / "other.toml").write_text('[denoise]\npreset = "tuned"\n')
     assert chosen(text, "--config", "other.toml")["preset"] == "tuned"
+
+
+def test_a_flag_of_the_file_is_taken_back(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_shot("in", [1])
+    Path("svgf-jax.toml").write_text("[denoise]\npng = true\n")
+    for given, files in (((), 2), (("--png=false",), 1)):
+        assert f"write {files} file" in run(capsys, "denoise", "in", "-o", "out", "--dry-run", *given)[2]
 
 
 def test_the_nearest_file_above_is_taken(tmp_path):
