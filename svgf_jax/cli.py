@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, NoReturn
 from cyclopts import App, CycloptsError, Group, Parameter
 
 from svgf_jax import __version__
+from svgf_jax.commands import terminal
 from svgf_jax.commands.ablate import ablate
 from svgf_jax.commands.compare import compare
 from svgf_jax.commands.demo import demo
@@ -92,5 +93,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def fail(message: str) -> NoReturn:
     """Tell an error and exit with 2."""
-    print(f"svgf-jax: {message}", file=sys.stderr)
+    terminal.tell(f"svgf-jax: {message}")
     sys.exit(2)

@@ -17,6 +17,7 @@ from svgf_jax.warping import NEAR, Residual, off
 CORRELATED = 0.15
 """Correlation of neighbours' noise from which on it matters: Mitsuba's default filter has 0.37, independent pixels 0."""
 REPEATED = 0.3
+"""Correlation of the noise from frame to frame from which on it is the same."""
 FIREFLIES = 0.15  # share of a signal's light
 CONVERGED = 0.03  # relative noise
 SHORT = 0.8  # share of pixels with history

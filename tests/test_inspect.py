@@ -12,7 +12,7 @@ from rooms import SIZE, camera, write_room
 from test_dry_run import run
 
 from svgf_jax import exr, sample
-from svgf_jax.commands.inspect import _sentence
+from svgf_jax.commands.inspect import _light, _sentence
 from svgf_jax.findings import Finding, judge, verdict
 from svgf_jax.frames import open_source
 from svgf_jax.inspection import inspect_source
@@ -305,6 +305,32 @@ def test_text_from_files_is_never_markup(tmp_path, capsys):
     assert code == 2
     assert "[red]x[bold]" in re.sub(r"\s", "", out)  # long paths go over several lines
     assert "[blink]spp" in out
+
+
+def test_names_from_files_do_not_steer_the_terminal(tmp_path, capsys):
+    folder = write_room(tmp_path / "in", numbers=range(2), rename=("albedo", "\x1b[31mred"))
+    assert "\\x1b[31mred.BGR" in run(capsys, "inspect", folder)[1]
+    given = ("--channel", "albedo=" + ",".join(f"\x1b[31mred.{c}" for c in "RGB"), "--dry-run", "-o", tmp_path / "out")
+    for arguments in (
+        ("inspect", folder),
+        ("denoise", folder, *given),
+        ("denoise", folder, "--channel", "id=\x1b[2J", "-o", "o"),
+    ):
+        assert "\x1b" not in "".join(run(capsys, *arguments)[1:])
+
+
+def test_each_correlation_has_its_own_limit(clean):
+    facts, _ = inspected(clean)
+    for value, texts in (
+        (0.2, ["correlated noise", "independent noise"]),
+        (0.4, ["correlated noise", "the same noise"]),
+    ):
+        facts = facts._replace(correlation=value, repeated=value)
+        said = dict(_light(facts))
+        assert [said[name].startswith(text) for name, text in zip(("neighbours", "frames"), texts, strict=True)] == [
+            True
+        ] * 2
+        assert ("seed" in {one.topic for one in judge(facts)}) == (value > 0.3)
 
 
 @pytest.mark.parametrize("columns", [80, 120])

@@ -193,7 +193,9 @@ def _print(title: str, found: Sequence["Measured"]) -> None:
 
     console = Console()
     with_meanings = console.width >= 130
-    table = Table(box=None, padding=(0, 1, 0, 0), title=Text(title), title_justify="left", title_style="")
+    table = Table(
+        box=None, padding=(0, 1, 0, 0), title=Text(terminal.visible(title)), title_justify="left", title_style=""
+    )
     table.add_column("row", no_wrap=True)
     for name, _ in COLUMNS.values():
         table.add_column(name, justify="right", no_wrap=True)

@@ -101,13 +101,13 @@ def print_scores(title: str, rows: Mapping[str, "Scores"]) -> None:
     cells = _cells(rows, lambda name, value: COLUMNS[name][1].format(value))
     names = [name for name in COLUMNS if any(row[name] for row in cells.values())]
     table = Table(box=SIMPLE)
-    table.add_column(Text(title))
+    table.add_column(Text(terminal.visible(title)))
     for name in names:
         table.add_column(COLUMNS[name][0], justify="right")
     for label, row in cells.items():
         if label == "mean":
             table.add_section()
-        table.add_row(Text(label), *(row[name] for name in names))
+        table.add_row(Text(terminal.visible(label)), *(row[name] for name in names))
     Console().print(table)
 
 

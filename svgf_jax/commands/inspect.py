@@ -80,8 +80,11 @@ def _print(facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str) -> 
     from rich.table import Table
     from rich.text import Text
 
+    def shown(text: str, style: str = "") -> Text:
+        return Text(terminal.visible(text), style=style)
+
     console = Console(highlight=False)
-    console.print(Text(facts.name, style="bold"))
+    console.print(shown(facts.name, style="bold"))
     sections = [(title, rows) for title, rows in _sections(facts) if rows]
     width = max(len(label) for _, rows in sections for label, _ in rows)
     for title, rows in sections:
@@ -89,9 +92,9 @@ def _print(facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str) -> 
         grid.add_column(width=width, no_wrap=True)
         grid.add_column(overflow="fold")
         for label, text in rows:
-            grid.add_row(Text(label, style="cyan"), Text(text))
+            grid.add_row(shown(label, style="cyan"), shown(text))
         console.print()
-        console.print(Text(title, style="bold"))
+        console.print(shown(title, style="bold"))
         console.print(Padding(grid, (0, 0, 0, 2)))
     for title, level, style in (
         ("Errors", "error", "bold red"),
@@ -102,18 +105,18 @@ def _print(facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str) -> 
         if not chosen:
             continue
         console.print()
-        console.print(Text(title, style=style))
+        console.print(shown(title, style=style))
         for number, one in enumerate(chosen, 1):
             grid = Table.grid(padding=(0, 1, 0, 0))
             grid.add_column(width=3, no_wrap=True, justify="right")
             grid.add_column(overflow="fold")
-            grid.add_row(Text(f"{number}."), Text(_sentence(one.text)))
+            grid.add_row(shown(f"{number}."), shown(_sentence(one.text)))
             if one.remedy:
-                grid.add_row(Text("->", style="green"), Text(one.remedy))
+                grid.add_row(shown("->", style="green"), shown(one.remedy))
             console.print(Padding(grid, (0, 0, 0, 1)))
     console.print()
     style = {"r": "bold green", "c": "bold yellow"}[conclusion[0]] if "cannot" not in conclusion else "bold red"
-    console.print(Text(conclusion, style=style))
+    console.print(shown(conclusion, style=style))
 
 
 def _sections(facts: "Facts") -> Iterator[tuple[str, Rows]]:
@@ -166,6 +169,8 @@ def _channels(facts: "Facts") -> Iterator[tuple[str, str]]:
 
 
 def _light(facts: "Facts") -> Iterator[tuple[str, str]]:
+    from svgf_jax.findings import CORRELATED, REPEATED
+
     for name, light in facts.light.items():
         level = "hardly any light" if light.noise is None else f"noise {100 * light.noise:.3g} % of the light"
         pixels, share = light.fireflies
@@ -177,8 +182,8 @@ def _light(facts: "Facts") -> Iterator[tuple[str, str]]:
         yield name, f"{level}; {flies}"
     if facts.psnr is not None:
         yield "picture", f"about {facts.psnr:.1f} dB (PSNR that svgf-jax compare would show, by the noise alone)"
-    yield "neighbours", _correlation(facts.correlation, "independent noise", "correlated noise")
-    yield "frames", _correlation(facts.repeated, "independent noise", "the same noise again")
+    yield "neighbours", _correlation(facts.correlation, CORRELATED, "independent noise", "correlated noise")
+    yield "frames", _correlation(facts.repeated, REPEATED, "independent noise", "the same noise again")
     broken = [
         f"{role} {', '.join(f'{count} {kind}' for kind, count in one._asdict().items() if count)}"
         for role, one in facts.broken.items()
@@ -186,12 +191,10 @@ def _light(facts: "Facts") -> Iterator[tuple[str, str]]:
     yield "broken", "; ".join(broken) or "no NaN, no infinity, nothing negative"
 
 
-def _correlation(value: float | None, low: str, high: str) -> str:
-    from svgf_jax.findings import CORRELATED
-
+def _correlation(value: float | None, limit: float, low: str, high: str) -> str:
     if value is None:
         return "cannot tell: too few pixels with noise"
-    return f"{high if value > CORRELATED else low} (correlation {value + 0.0:.2f})"
+    return f"{high if value > limit else low} (correlation {value + 0.0:.2f})"
 
 
 def _guides(facts: "Facts") -> Iterator[tuple[str, str]]:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -30,9 +31,17 @@ REPAIRS = {
 """What became of the pixels that a frame's report counts, by its reason."""
 
 
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # but line ends and tabs
+
+
+def visible(text: str) -> str:
+    """`text` with control characters spelt out: names from files shall not steer the terminal."""
+    return _CONTROL.sub(lambda found: f"\\x{ord(found.group()):02x}", text)
+
+
 def tell(text: str) -> None:
     """One message on the standard error."""
-    print(text, file=sys.stderr, flush=True)
+    print(visible(text), file=sys.stderr, flush=True)
 
 
 def warn(texts: Iterable[str]) -> None:
