@@ -95,18 +95,25 @@ def _load(path: Path) -> Table:
             fields[key] = {role: _texts(spellings) for role, spellings in content.pop(key, {}).items()}
         for key in ("meaning", "settings"):
             fields[key] = {role: str(text) for role, text in content.pop(key, {}).items()}
-        fields |= {"layered": bool(content.pop("layered", False)), "cameras": str(content.pop("cameras", ""))}
+        fields |= {"layered": _flag(content.pop("layered", False)), "cameras": str(content.pop("cameras", ""))}
         fields |= {key: _texts(content.pop(key, ())) for key in ("main", "complete", "uncertain", "other_layers")}
-        fields["light"] = tuple(
-            Signal(one["name"], _texts(one["channels"]), _texts(one.get("albedo", ())), bool(one.get("divided", False)))
-            for one in content.pop("light", ())
-        )
+        fields["light"] = tuple(_signal(**one) for one in content.pop("light", ()))
     except (AttributeError, TypeError, KeyError) as error:
         raise SvgfError(f"{path}: {error!r} where a table of a renderer was read; see the ones in {FOLDER}.") from error
     if content:
         raise SvgfError(f"{path}: {', '.join(content)} not known; wanted {', '.join(Table._fields[1:])}.")
     _check_meaning(path, fields["meaning"])
     return Table(**fields)
+
+
+def _signal(name: str, channels: Any, albedo: Any = (), divided: bool = False) -> Signal:
+    return Signal(name, _texts(channels), _texts(albedo), _flag(divided))
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise TypeError(f"got {value!r}, wanted true or false")
+    return value
 
 
 def _check_meaning(path: Path, meaning: Mapping[str, str]) -> None:

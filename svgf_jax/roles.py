@@ -179,6 +179,12 @@ def resolve_roles(
         layers.pop(role, None)
     light = {role: Light("albedo", False) for role in _SIGNALS if role in layers}
     if not asked & {"radiance", "direct", "indirect"} and (kinds := _light_apart(layers, channels, table, where)):
+        if "albedo" in asked:
+            raise SvgfError(
+                f"Got an albedo by hand, but in files of {table.title} each light has its own: {', '.join(kinds)}. Leave it out, "
+                "or say by hand what light it belongs to (--channel radiance=NAME,NAME,NAME)."
+            )
+        layers.pop("albedo", None)
         light = kinds
     signals = tuple(light)
     if not signals:
@@ -242,10 +248,8 @@ def _light_apart(layers: dict[str, Layer], channels: Collection[str], table: Tab
         if albedo is not None:
             layers[f"{signal.name}_albedo"] = Layer(albedo, False, f"{table.name} name")
         light[signal.name] = Light(f"{signal.name}_albedo" if albedo else "", signal.divided)
-    if light:
-        layers.pop("albedo", None)
-        if "radiance" in layers and not (table.complete and set(table.complete) <= layers.keys()):
-            light[REST] = Light("", False)
+    if light and "radiance" in layers and not (table.complete and set(table.complete) <= layers.keys()):
+        light[REST] = Light("", False)
     return light
 
 

@@ -310,7 +310,9 @@ def test_a_table_of_ones_own(tmp_path):
     [
         ("[channels]\nalbedo = 3\n", "where a table of a renderer was read"),
         ("chanels = 3\n", "chanels not known; wanted title, detect"),
-        ("[[light]]\nchannels = ['a']\n", "KeyError"),
+        ("[[light]]\nchannels = ['a']\n", "missing 1 required positional argument: 'name'"),
+        ("[[light]]\nname = 'a'\nchannels = ['a']\nalbdo = 'b'\n", "unexpected keyword argument 'albdo'"),
+        ("layered = 'false'\n", "got 'false', wanted true or false"),
         ('[meaning]\nid = "none"\n', "id means 'none'; wanted the number"),
         ('[meaning]\nnormal = "view"\n', "normal means 'view'; wanted camera, camera z-back, camera or world"),
         ('[meaning]\nalbedo = "sRGB"\n', "albedo means 'sRGB'; wanted no meaning for this role"),

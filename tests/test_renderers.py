@@ -176,8 +176,13 @@ def test_what_is_given_by_hand_comes_before_the_table(tmp_path):
     folder = put(tmp_path, old_cycles() | planes("RL.Mine", 7), "a_1.exr")
     by_hand = [f"RL.Mine.{c}" for c in "RGB"]
     assert open_source(folder, channel={"radiance": by_hand}).roles.signals == ("radiance",)
-    frame = read_frame(open_source(folder, channel={"albedo": by_hand}, motion="fraction from-previous"), 0).frame
+    frame = read_frame(open_source(folder, motion="fraction from-previous"), 0).frame
     np.testing.assert_allclose(frame.motion[0, 0], [-1 * W, -2 * H])
+
+
+def test_an_albedo_by_hand_is_not_passed_over():
+    with pytest.raises(SvgfError, match="each light has its own: diffuse_direct"):
+        open_source(DATA / "cycles" / "half", channel={"albedo": ["ViewLayer.Diffuse Color.R"]})
 
 
 def test_mitsuba_files():
