@@ -43,7 +43,7 @@ def test_the_options_of_the_command(tmp_path, capsys):
     assert "2 view layers: 'Other', 'ViewLayer'. Say which: --layer NAME" in " ".join(told.split())
     code, told = run(MULTIPART / "layers", "--layer", "Other")
     assert code == 0, told
-    assert "glossy_direct Other.Glossy Direct.RGB, albedo Other.Glossy Color.RGB" in told
+    assert "glossy_direct Other.Glossy Direct.RGB, albedo Other.Glossy Color.RGB" in " ".join(told.split())
     code, told = run(MULTIPART / "multipart", "--renderer", "cycles", "--motion", "ndc")
     assert code == 0, told
     assert "ViewLayer.Vector.XY (cycles name; ndc y-down to-previous)" in told
