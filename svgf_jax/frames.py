@@ -190,12 +190,17 @@ def read_frame(source: Source, index: int) -> LoadedFrame:
     return LoadedFrame(frame, number, str(path), image, counts, notes)
 
 
-def read_planes(source: Source, index: int) -> tuple[dict[str, np.ndarray], exr.Image]:
-    """The channels of each role of a frame as its files have them, `[H, W, C]`, and its main file. Raises as `read_frame`."""
+def read_planes(
+    source: Source, index: int, *, image: exr.Image | None = None
+) -> tuple[dict[str, np.ndarray], exr.Image]:
+    """The channels of each role of a frame as its files have them, `[H, W, C]`, and its main file. Raises as `read_frame`.
+
+    `image` is the main file, where it has been read already.
+    """
     number, path = source.sequence.files[index]
     if path is None:
         raise SvgfError(f"{source.sequence.name}: frame {number} is missing; render it, or go on without (--missing).")
-    images = {path: _read(path, source)}
+    images = {path: _read(path, source) if image is None else image}
     planes: dict[str, np.ndarray] = {}
     for role, layer in source.roles.layers.items():
         where = str(source.files[role].files[index][1]) if layer.own_file else path

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from svgf_jax import exr, geometry, noise
+from svgf_jax import geometry, noise
 from svgf_jax.cameras import Camera, find_camera
 from svgf_jax.estimates import Estimate, estimate
-from svgf_jax.frames import LoadedFrame, Source, read_frame, told_once
+from svgf_jax.frames import LoadedFrame, Source, read_frame, read_planes, told_once
 from svgf_jax.geometry import Fit
 from svgf_jax.motion import Convention, parse_convention
 from svgf_jax.noise import Fireflies
@@ -211,7 +211,7 @@ def _pairs(source: Source, scan: Scan) -> list[tuple[int, int]]:
 def _load(source: Source, index: int) -> _Read:
     loaded = read_frame(source, index)
     camera = find_camera(source.cameras, loaded.number) if source.cameras is not None else None
-    planes = _planes(source, index, loaded)
+    planes, _ = read_planes(source, index, image=loaded.image)
     x, y = (max(0, (size - SIDE) // 2) for size in loaded.frame.depth.shape[::-1])
     cut = np.s_[y : y + SIDE, x : x + SIDE]
     whole = loaded.frame._asdict().items()
@@ -220,18 +220,6 @@ def _load(source: Source, index: int) -> _Read:
         for name, value in whole
     ]
     return _Read(loaded, planes, camera, Frame(*parts), {role: plane[cut] for role, plane in planes.items()}, (x, y))
-
-
-def _planes(source: Source, index: int, loaded: LoadedFrame) -> dict[str, np.ndarray]:
-    """The channels of each role as the files have them, `[H, W, C]`."""
-    images = {loaded.path: loaded.image}
-    planes: dict[str, np.ndarray] = {}
-    for role, layer in source.roles.layers.items():
-        path = str(source.files[role].files[index][1]) if layer.own_file else loaded.path
-        if path not in images:
-            images[path] = exr.read(path)
-        planes[role] = np.stack([images[path].channels[name] for name in layer.channels], -1)
-    return planes
 
 
 def _noise(frame: Frame) -> _Noise:

@@ -23,12 +23,10 @@ Planes = Any  # a tree whose leaves are [H, W] arrays
 Sums = TypeVar("Sums")
 
 BY_WIDTH = 0  # rows per strip: as many as have STRIP_PIXELS pixels
-STRIP_PIXELS = (
-    8192  # the fastest of 4 to 64 thousand, at 480 and at 1920 pixels width: a strip's planes fit the level-2 cache
-)
-DIVIDED = (
-    "svgf_jax rows of "  # how the mesh axis is called over which the rows are divided, and then the image's height
-)
+# The fastest of 4 to 64 thousand, at 480 and at 1920 pixels width: a strip's planes fit the level-2 cache.
+STRIP_PIXELS = 8192
+# How the mesh axis is called over which the rows are divided, and then the image's height.
+DIVIDED = "svgf_jax rows of "
 UNROLL_FROM = 2**19  # pixels of an image whose taps are unrolled: half the time, for some seconds more of compilation
 
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
@@ -158,18 +158,10 @@ def denoise(
         references, lacking = ({}, ()) if reference is None else pair_references(source.sequence, reference)
         terminal.warn(lacking)
         shown = reports.Run(source, out, method, chosen_preset, chosen, config, options, references, {})
+    task: dict[str, Any] = {"params": chosen, "config": config, "method": method, "preset": chosen_preset}
+    task |= {"options": options, "video": video, "fps": fps}
     if dry_run:
-        plan, _ = streaming.prepare(
-            source,
-            out,
-            params=chosen,
-            config=config,
-            method=method,
-            preset=chosen_preset,
-            options=options,
-            video=video,
-            fps=fps,
-        )
+        plan, _ = streaming.prepare(source, out, **task)
         told = rehearse(source, scan, plan, config=config, options=options, resume=resume, overwrite=overwrite)
         if json:
             terminal.print_json(told | {"method": method, "preset": chosen_preset} | numbers(chosen, config))
@@ -187,13 +179,7 @@ def denoise(
         summary = streaming.run(
             source,
             out,
-            params=chosen,
-            config=config,
-            method=method,
-            preset=chosen_preset,
-            options=options,
-            video=video,
-            fps=fps,
+            **task,
             resume=resume,
             overwrite=overwrite,
             device=device,
