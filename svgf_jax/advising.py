@@ -5,7 +5,17 @@ from collections.abc import Collection, Iterator
 from svgf_jax.cameras import Cameras
 from svgf_jax.motion import parse_convention
 from svgf_jax.renderers import Table
-from svgf_jax.roles import Roles
+from svgf_jax.roles import REST, Roles, short_names
+
+
+def absences(roles: Roles, cameras: Cameras | None, table: Table) -> dict[str, str]:
+    """By role that is not there and should be: what stands in for it, what that costs, and what to switch on."""
+    wanted = [role for role in ("albedo", "normal", "depth", "motion") if role in roles.absent]
+    return {
+        role: f"no {role}: taken as {roles.absent[role]}.{_switch_on(role, table)}"
+        for role in wanted
+        if not (role == "motion" and cameras)
+    }
 
 
 def advice(roles: Roles, half: Collection[str], cameras: Cameras | None, table: Table) -> Iterator[str]:
@@ -17,13 +27,17 @@ def advice(roles: Roles, half: Collection[str], cameras: Cameras | None, table: 
         cameras: if there are any.
         table: the renderer's, which says what to switch on.
     """
-
-    def switch_on(role: str) -> str:
-        return f" In {table.title}: {table.settings[role]}." if role in table.settings else ""
-
-    for role in ("albedo", "normal", "depth", "motion"):
-        if role in roles.absent and not (role == "motion" and cameras) and not roles.absent[role].endswith("say"):
-            yield f"no {role}: taken as {roles.absent[role]}.{switch_on(role)}"
+    yield from absences(roles, cameras, table).values()
+    for albedo, divided in dict.fromkeys((one.albedo, one.divided) for one in roles.bare.values()):
+        lights = [short_names(one.channels) for one in roles.bare.values() if one.albedo == albedo]
+        if not divided:
+            cost = "textures are filtered together with this light and will blur"
+        elif REST in roles.signals:
+            cost = f"this light goes to {REST}, in which textures are filtered together with the light and will blur"
+        else:
+            cost = "what this light was divided by is not known, and it is left out"
+        setting = f" ({table.settings['albedo']})" if "albedo" in table.settings else ""
+        yield f"{' and '.join(lights)} without {albedo}: {cost}. In {table.title}: switch on {albedo}{setting}."
     for role in set(table.uncertain) & roles.layers.keys():
         yield (
             f"what {role} means in files of {table.title} is not certain; taken as {parse_convention(roles.layers[role].meaning)}. "
@@ -31,9 +45,8 @@ def advice(roles: Roles, half: Collection[str], cameras: Cameras | None, table: 
         )
     means = {role: layer.meaning.split() for role, layer in roles.layers.items()}
     if not cameras and "camera" in means.get("normal", ()) and "or" not in means["normal"]:
-        yield (
-            f"normals are in camera space, and no camera is known: where it turns, history will be lost.{switch_on('normal')}"
-        )
+        setting = _switch_on("normal", table)
+        yield f"normals are in camera space, and no camera is known: where it turns, history will be lost.{setting}"
     if not cameras and means.get("depth") == ["distance"]:
         yield "depth is the distance along the ray, and no camera is known to make z of it: slopes will be a little off."
     for role in ("depth", "position"):
@@ -41,3 +54,7 @@ def advice(roles: Roles, half: Collection[str], cameras: Cameras | None, table: 
             yield f"{role} is in half float, in steps of 0.1 %: slopes become stairs. Let the renderer write 32-bit."
     if cameras and not roles.layers.keys() & {"depth", "position"}:
         yield f"{cameras.path} is of no use without depth or position."
+
+
+def _switch_on(role: str, table: Table) -> str:
+    return f" In {table.title}: {table.settings[role]}." if role in table.settings else ""

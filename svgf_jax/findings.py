@@ -77,8 +77,6 @@ def _files(facts: Facts, gaps_allowed: bool) -> Iterator[Finding]:
 
 def _roles(facts: Facts) -> Iterator[Finding]:
     for role, cost in facts.roles.absent.items():
-        if cost.endswith((" say", " says")):
-            continue
         level = "note" if role in ("emission", "id") else "warning"
         setting = facts.table.settings.get(role)
         switch = f"{facts.table.title}: {setting}." if setting else "Let the renderer write it."
@@ -86,8 +84,7 @@ def _roles(facts: Facts) -> Iterator[Finding]:
             level, f"no {role}", f"no {role}: taken as {cost}.", f"{switch} {_elsewhere(role, facts.scan.unused)}"
         )
     for text in facts.warnings:
-        if not text.startswith("no "):
-            yield Finding("warning", "reading", text, "")
+        yield Finding("warning", "reading", text, "")
 
 
 def _elsewhere(role: str, unused: tuple[str, ...]) -> str:

@@ -143,13 +143,13 @@ def open_source(
     found = find_cameras(cameras, sequence, header, path, elsewhere=table.cameras)
     check_roles(roles, found, position=position, where=path)
     if found and roles.layers.keys() & {"depth", "position"} and "motion" not in roles.layers:
-        roles = roles._replace(absent=roles.absent | {"motion": f"{found.path} says"})
+        roles = roles.told_by("motion", f"{found.path} says")
     if (
         "depth" not in roles.layers
         and "position" in roles.layers
         and (found or "camera" in meaning_of(roles, "position"))
     ):
-        roles = roles._replace(absent=roles.absent | {"depth": "the positions say"})
+        roles = roles.told_by("depth", "the positions say")
     half = set()
     for role, one in roles.layers.items():
         types = own[role][1].channels if one.own_file else header.channels

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from svgf_jax import geometry, noise
+from svgf_jax.advising import absences
 from svgf_jax.cameras import Camera, find_camera
 from svgf_jax.estimates import Estimate, estimate
 from svgf_jax.frames import LoadedFrame, Source, read_frame, read_planes, told_once
@@ -147,12 +148,18 @@ def inspect_source(source: Source, *, params: Params = Params(), config: Any = C
     share, still = _mean(one.share for one in matched), _mean(one.still for one in matched)
     most = float(np.max(params.max_history))
     last = read[max(read)]
+    told = set(absences(source.roles, source.cameras, source.table).values())  # the roles say it themselves
     return Facts(
         name=source.sequence.name,
         scan=scan,
         roles=source.roles,
         table=source.table,
-        warnings=told_once([*source.warnings, *(note for one in read.values() for note in one.loaded.notes)]),
+        warnings=told_once(
+            [
+                *(one for one in source.warnings if one not in told),
+                *(note for one in read.values() for note in one.loaded.notes),
+            ]
+        ),
         size=(width, height),
         crop=source.data_window != source.display_window,
         samples=samples_per_pixel(scan.attributes, like=_layer(source.roles)),

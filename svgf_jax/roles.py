@@ -32,9 +32,10 @@ files of the same name beside `beauty_####.exr` (or color_): `normal_####.exr`, 
 import difflib
 import os
 from collections.abc import Collection, Iterable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
-from svgf_jax.renderers import NATIVE, Table, pick
+from svgf_jax.renderers import NATIVE, Signal, Table, pick
 from svgf_jax.types import SvgfError
 
 WIDTH = {
@@ -103,6 +104,14 @@ class Light(NamedTuple):
     divided: bool
 
 
+class Bare(NamedTuple):
+    """A kind of light whose albedo is not there: its channels, the albedo's name, and whether it is divided by that."""
+
+    channels: tuple[str, ...]
+    albedo: str
+    divided: bool
+
+
 REST = "rest"
 """The signal that is what a beauty has beyond the kinds of light that are there."""
 
@@ -111,7 +120,9 @@ class Roles(NamedTuple):
     """Layer by role for what is there, and for what is not the default that stands in and what that costs.
 
     `signals` names the roles that are filtered, in the order of `Frame.radiance`, and `light` says what each is. Where kinds of
-    light and the beauty that they make up are both there, the layer `radiance` is that beauty, and no signal.
+    light and the beauty that they make up are both there, the layer `radiance` is that beauty, and no signal; `rest` names what
+    of it has no signal of its own. `derived` says by role what tells it where no channel does, and `bare` which kinds of light
+    lack their albedo; those that are divided by it are no signals.
     """
 
     layers: dict[str, Layer]
@@ -119,19 +130,41 @@ class Roles(NamedTuple):
     signals: tuple[str, ...]
     light: dict[str, Light]
     renderer: str = NATIVE.name
+    derived: Mapping[str, str] = MappingProxyType({})
+    bare: Mapping[str, Bare] = MappingProxyType({})
+    rest: tuple[str, ...] = ()
 
     def describe(self, *, absent: bool = True) -> str:
         """The mapping in one line a role, for people; `absent`: with those that are not there."""
+        told = self.told(absent=absent)
+        width = max(map(len, told))
+        return "\n".join(f"{role:{width}}  {text}" for role, text in told.items())
+
+    def told(self, *, absent: bool = True, types: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+        """By role, in words, its channels, or what there is in place of them; `types`: what the channels of a role hold."""
         told: dict[str, str] = {}
         for role, layer in self.layers.items():
             if role.removesuffix("_albedo") in self.light and role.endswith("_albedo"):
                 continue  # stands in its light's line
             by = self.layers.get(f"{role}_albedo") if role in self.light else None
             names = short_names(layer.channels) + (f", albedo {short_names(by.channels)}" if by else "")
-            told[role] = f"{names} ({layer.reason}{'; ' if layer.meaning else ''}{layer.meaning})"
-        told |= {role: without(default) for role, default in self.absent.items() if absent}
-        width = max(map(len, told))
-        return "\n".join(f"{role:{width}}  {text}" for role, text in told.items())
+            kind = f", {types[role]}" if role in types else ""
+            told[role] = f"{names}{kind} ({layer.reason}{'; ' if layer.meaning else ''}{layer.meaning})"
+        if REST in self.signals:
+            without = f": {', '.join(map(self._in_rest, self.rest))}" if self.rest else ""
+            told[REST] = f"{short_names(self.layers['radiance'].channels)} less the light above{without}"
+        if absent:
+            told |= {role: f"not there: {by}" for role, by in self.derived.items()}
+            told |= {role: f"not there, taken as {default}" for role, default in self.absent.items()}
+        return told
+
+    def told_by(self, role: str, what: str) -> "Roles":
+        """The same where something else tells a role that is not there: `cameras.json says`."""
+        absent = {other: default for other, default in self.absent.items() if other != role}
+        return self._replace(absent=absent, derived={**self.derived, role: what})
+
+    def _in_rest(self, role: str) -> str:
+        return f"{role} (no {self.bare[role].albedo})" if role in self.bare else role
 
 
 def resolve_roles(
@@ -178,14 +211,15 @@ def resolve_roles(
     for role in parts if "radiance" in asked else {"radiance"} if parts else ():
         layers.pop(role, None)
     light = {role: Light("albedo", False) for role in _SIGNALS if role in layers}
+    bare, rest = {}, ()
     if not asked & {"radiance", "direct", "indirect"} and (kinds := _light_apart(layers, channels, table, where)):
         if "albedo" in asked:
             raise SvgfError(
-                f"Got an albedo by hand, but in files of {table.title} each light has its own: {', '.join(kinds)}. Leave it out, "
-                "or say by hand what light it belongs to (--channel radiance=NAME,NAME,NAME)."
+                f"Got an albedo by hand, but in files of {table.title} each light has its own: {', '.join(kinds[0])}. Leave it "
+                "out, or say by hand what light it belongs to (--channel radiance=NAME,NAME,NAME)."
             )
         layers.pop("albedo", None)
-        light = kinds
+        light, bare, rest = kinds
     signals = tuple(light)
     if not signals:
         raise SvgfError(
@@ -202,12 +236,7 @@ def resolve_roles(
     absent = {role: text for role, text in _ABSENT.items() if role not in layers}
     if any(f"{role}_albedo" in layers for role in signals):
         absent.pop("albedo", None)
-    return Roles(layers, absent, signals, light, table.name)
-
-
-def without(default: str) -> str:
-    """What is told of a role that is absent: what stands in for it, or what else says it (`cameras.json says`)."""
-    return f"not there{':' if default.endswith((' say', ' says')) else ', taken as'} {default}"
+    return Roles(layers, absent, signals, light, table.name, bare=bare, rest=rest)
 
 
 def short_names(names: tuple[str, ...]) -> str:
@@ -234,13 +263,20 @@ def canonical_role(name: str) -> str:
     return role
 
 
-def _light_apart(layers: dict[str, Layer], channels: Collection[str], table: Table, where: str) -> dict[str, Light]:
-    """The kinds of light that a renderer wrote apart, put into `layers` with their albedos."""
+def _light_apart(
+    layers: dict[str, Layer], channels: Collection[str], table: Table, where: str
+) -> tuple[dict[str, Light], dict[str, Bare], tuple[str, ...]] | None:
+    """The kinds of light that a renderer wrote apart, put into `layers` with their albedos; those that lack one; `Roles.rest`."""
     light: dict[str, Light] = {}
+    bare: dict[str, Bare] = {}
     for signal in table.light:
         names = pick(signal.name, signal.channels, 3, channels, table=table, where=where)
         albedo = pick(f"{signal.name}_albedo", signal.albedo, 3, channels, table=table, where=where)
-        if names is None or (signal.divided and albedo is None):
+        if names is None:
+            continue
+        if albedo is None and signal.albedo:
+            bare[signal.name] = Bare(names, _of_its_kind(signal, names), signal.divided)
+        if albedo is None and signal.divided:
             continue
         layers[signal.name] = Layer(
             names, False, f"{table.name} name", "divided by its albedo" if signal.divided else ""
@@ -248,9 +284,19 @@ def _light_apart(layers: dict[str, Layer], channels: Collection[str], table: Tab
         if albedo is not None:
             layers[f"{signal.name}_albedo"] = Layer(albedo, False, f"{table.name} name")
         light[signal.name] = Light(f"{signal.name}_albedo" if albedo else "", signal.divided)
-    if light and "radiance" in layers and not (table.complete and set(table.complete) <= layers.keys()):
-        light[REST] = Light("", False)
-    return light
+    if not light:
+        return None
+    rest = [role for role in table.complete if role not in layers]
+    if "radiance" not in layers or (table.complete and not rest):
+        return light, bare, ()
+    rest += [role for role, one in bare.items() if one.divided and role not in rest]
+    return light | {REST: Light("", False)}, bare, tuple(rest)
+
+
+def _of_its_kind(signal: Signal, names: tuple[str, ...]) -> str:
+    """What the albedo of a light is called where the light is called so: GlossCol where it is GlossDir, not Glossy Color."""
+    at = next((i for i, text in enumerate(signal.channels) if names[0].endswith(text[:-2])), 0)
+    return signal.albedo[min(at, len(signal.albedo) - 1)].replace(".RGB", "").replace(".rgb", "")
 
 
 def _given(

@@ -161,6 +161,27 @@ def test_light_without_its_colour_is_left_to_the_rest(tmp_path):
     assert source.roles.signals == ("glossy_direct", "glossy_indirect", "volume_direct", "rest")
     frame = read_frame(source, 0).frame
     np.testing.assert_allclose(frame.radiance[-1], 4 - 0.75 - 0.25 - 0.25)
+    (told,) = [text for text in source.warnings if "Diff" in text]
+    assert told.startswith(
+        "RL.DiffDir.RGB and RL.DiffInd.RGB without DiffCol: this light goes to rest, in which textures"
+    )
+    assert "In Blender Cycles: switch on DiffCol (View Layer > Passes > Light" in told
+    assert source.roles.told()["rest"] == (
+        "RL.Noisy Image.RGB less the light above: diffuse_direct (no DiffCol), diffuse_indirect (no DiffCol), "
+        "transmission_direct, transmission_indirect"
+    )
+
+
+def test_light_without_its_colour_and_without_a_beauty_is_left_out_and_told(tmp_path):
+    channels = {
+        name: plane
+        for name, plane in old_cycles(GlossCol=True).items()
+        if "Combined" not in name and "Noisy" not in name
+    }
+    source = open_source(put(tmp_path, channels, "a_1.exr"))
+    assert source.roles.signals == (*KINDS[:2], "volume_direct")
+    assert any(" without GlossCol: " in text and "it is left out" in text for text in source.warnings)
+    assert "rest" not in source.roles.told()
 
 
 def test_a_blender_file_with_its_beauty_alone(tmp_path):

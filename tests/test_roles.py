@@ -53,7 +53,9 @@ def test_a_plain_beauty_is_one_signal_and_every_absence_says_what_it_costs():
 
 def test_long_names_and_what_else_says_a_role_are_told_in_line():
     layers = {"radiance": Layer(("R",), False, "x"), "glossy_indirect": Layer(("G",), False, "x")}
-    text = Roles(layers, {"motion": "cameras.json says"}, ("radiance",), {}).describe()
+    roles = Roles(layers, {"motion": "0: trails"}, ("radiance",), {}).told_by("motion", "cameras.json says")
+    assert roles.absent == {}
+    text = roles.describe()
     assert text == "radiance         R (x)\nglossy_indirect  G (x)\nmotion           not there: cameras.json says"
 
 

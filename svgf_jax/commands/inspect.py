@@ -147,19 +147,10 @@ def _files(facts: "Facts") -> Iterator[tuple[str, str]]:
 
 
 def _channels(facts: "Facts") -> Iterator[tuple[str, str]]:
-    from svgf_jax.roles import short_names, without
+    from svgf_jax.roles import short_names
 
-    roles = facts.roles
     yield "names", facts.table.title
-    for role, layer in roles.layers.items():
-        if role.removesuffix("_albedo") in roles.light and role.endswith("_albedo"):
-            continue  # stands in its light's line
-        by = roles.layers.get(f"{role}_albedo")
-        names = short_names(layer.channels) + (f", albedo {short_names(by.channels)}" if by else "")
-        meaning = f"; {layer.meaning}" if layer.meaning else ""
-        yield role, f"{names}, {facts.scan.types.get(role, '')} ({layer.reason}{meaning})"
-    for role, default in roles.absent.items():
-        yield role, without(default)
+    yield from facts.roles.told(types=facts.scan.types).items()
     stems: dict[str, list[str]] = {}
     for name in facts.scan.unused:
         stems.setdefault(name.rpartition(".")[0], []).append(name)
@@ -269,7 +260,10 @@ def _record(facts: "Facts") -> dict[str, Any]:
     record["roles"] = {
         "layers": {role: layer._asdict() for role, layer in facts.roles.layers.items()},
         "absent": facts.roles.absent,
+        "derived": dict(facts.roles.derived),
         "signals": facts.roles.signals,
+        "bare": dict(facts.roles.bare),
+        "rest": facts.roles.rest,
         "renderer": facts.table.name,
     }
     del record["table"]
