@@ -16,9 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from svgf_jax import atomic
-from svgf_jax.types import SvgfError
-
 WIDTH = 640  # pixels: pictures are never wider
 # Dark to bright in even steps of lightness, by eye; black to white in grey print too.
 _HEAT = (
@@ -58,13 +55,13 @@ class Shown(NamedTuple):
         number: of the frame.
         pictures: data URLs by name; any two can be compared.
         maps: for a picture by name, data URLs of maps that belong to it.
-        notes: for a picture by name, a few words.
+        psnr: for a picture by name, in dB.
     """
 
     number: int
     pictures: Mapping[str, str]
     maps: Mapping[str, Mapping[str, str]] = {}
-    notes: Mapping[str, str] = {}
+    psnr: Mapping[str, float] = {}
 
 
 class Legend(NamedTuple):
@@ -90,14 +87,6 @@ def document(title: str, sections: Iterable[str]) -> str:
         f'<!doctype html>\n<html lang="en"><head>{head}<title>{escape(title)}</title>{icon}\n<style>\n{style}</style></head>\n'
         f"<body>\n{body}\n<script>\n{script}</script>\n</body></html>\n"
     )
-
-
-def write(path: Path, text: str) -> None:
-    """Write a page under a temporary name and rename it. Raises SvgfError."""
-    try:
-        atomic.write_text(path, text)
-    except OSError as error:
-        raise SvgfError(f"{path}: can't write the report: {error.strerror or error}") from None
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[object]], *, words: bool = False) -> str:
@@ -242,7 +231,9 @@ def viewer(frames: Sequence[Shown], *, left: str, right: str, legends: Mapping[s
         )
         return f'<label>{label} <select id="{label}">{options}</select></label>'
 
-    data = json.dumps({"frames": [frame._asdict() for frame in frames], "legends": legends}).replace("<", "\\u003c")
+    told = [{name: f"{value:.2f} dB" for name, value in frame.psnr.items()} for frame in frames]
+    shown = [frame._replace(psnr={})._asdict() | {"notes": notes} for frame, notes in zip(frames, told, strict=True)]
+    data = json.dumps({"frames": shown, "legends": legends}).replace("<", "\\u003c")
     last = len(frames) - 1
     return f"""
 <div class="row">{choice("left", left)}{choice("right", right)}</div>

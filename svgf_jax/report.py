@@ -199,7 +199,7 @@ def watch_rows(
                 number,
                 {**one.pictures, **before.pictures},
                 {**one.maps, **before.maps},
-                {**one.notes, **before.notes},
+                {**one.psnr, **before.psnr},
             )
 
     return on_image, lambda: [one for one in frames_of.values() if one.pictures]
@@ -310,7 +310,7 @@ def _curves(x: Sequence[int], scores: Sequence[metrics.Scores | None], psnr: Map
 
 def _noisy_line(shown: Sequence[Shown], name: str = "noisy") -> dict[str, tuple[list[int], list[float]]]:
     """The PSNR before the filter, of the frames that are shown."""
-    known = [(frame.number, float(frame.notes[name].split()[0])) for frame in shown if name in frame.notes]
+    known = [(frame.number, frame.psnr[name]) for frame in shown if name in frame.psnr]
     return {name: ([number for number, _ in known], [value for _, value in known])} if known else {}
 
 

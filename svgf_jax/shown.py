@@ -38,17 +38,17 @@ def shown_frame(
     shown = {name: preview.to_8bit(image, exposure=exposure, curve=curve) for name, image in every.items()}
     urls = {name: page.picture(picture, most=most) for name, picture in shown.items()}
     known = {name: dict(maps.get(name, {})) for name in pictures}
-    notes = {}
+    psnr = {}
     for name, image in pictures.items() if target is not None else ():
         assert target is not None
         if image.shape == target.shape:
-            notes[name] = f"{metrics.psnr(image, target):.2f} dB"
+            psnr[name] = metrics.psnr(image, target)
             against = {"difference": difference(image, target)}
             if importlib.util.find_spec("flip_evaluator") is not None:
                 pair = (_fitted(picture / np.float32(255)) for picture in (shown[name], shown["reference"]))
                 against["FLIP"] = page.heat(metrics.flip_map(*pair))
             known[name] = encoded(against, most) | known[name]
-    return Shown(number, urls, {name: found for name, found in known.items() if found}, notes)
+    return Shown(number, urls, {name: found for name, found in known.items() if found}, psnr)
 
 
 def difference(image: np.ndarray, reference: np.ndarray) -> np.ndarray:

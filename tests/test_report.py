@@ -89,7 +89,7 @@ def make(tmp_path_factory):
     )
     summary = streaming.run(source, out, resume=True, on_output=report.watch(run), **options)
     text = report.run_page(run, summary, repairs=terminal.repairs)
-    page.write(folder / "page.html", text)
+    (folder / "page.html").write_text(text, encoding="utf-8")
     return run, summary, text, folder
 
 

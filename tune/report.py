@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from svgf_jax import Config, Params, page
+from svgf_jax.commands import results
 from svgf_jax.page import Line, Raw, Shown
 from svgf_jax.shown import legends, shown_frame
 from tune.evaluate import filtered
@@ -47,7 +48,7 @@ def write_report(
         _profiles(curves) if curves else "",
         _maps(found, maps),
     ]
-    page.write(path, page.document("svgf-tune", sections))
+    results.save(path, page.document("svgf-tune", sections))
 
 
 def _loss_curve(found: Fit) -> str:
