@@ -28,11 +28,42 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from svgf_jax.motion import parse_convention
-from svgf_jax.toml import read_toml
+from svgf_jax.parameters import sentences, suggest
+from svgf_jax.toml import TomlFile, place, read_toml
 from svgf_jax.types import SvgfError
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
-_SPACES = ("camera", "camera z-back", "camera or world")
+WIDTH = {
+    "direct": 3,
+    "indirect": 3,
+    "radiance": 3,
+    "emission": 3,
+    "environment": 3,
+    "albedo": 3,
+    "normal": 3,
+    "depth": 1,
+    "motion": 2,
+    "id": 1,
+    "position": 3,
+    "hit_distance": 1,
+    "roughness": 1,
+    "alpha": 1,
+    "direct_variance": 1,
+    "indirect_variance": 1,
+    "radiance_variance": 1,
+}
+"""Number of channels of each role."""
+
+ALIASES = {"color": "radiance", "colour": "radiance", "beauty": "radiance", "object_id": "id"}
+
+_NAMES: dict[str, tuple[str, ...]] = {
+    "detect": ("channels", "attributes", "files"),
+    "channels": (*WIDTH, "camera_normal", "camera_position"),
+    "files": tuple(WIDTH),
+    "meaning": ("motion", "depth", "normal", "position", "id"),
+    "settings": tuple(WIDTH),
+}
+"""What may stand in each table of a table."""
 FOLDER = Path(__file__).parent / "tables"
 
 
@@ -88,44 +119,82 @@ def load_table(name: str) -> Table:
 
 @cache
 def _load(path: Path) -> Table:
-    content = read_toml(path, "table of a renderer").content
-    fields: dict[str, Any] = {"name": path.stem, "title": content.pop("title", path.stem)}
-    try:
-        for key in ("detect", "channels", "files"):
-            fields[key] = {role: _texts(spellings) for role, spellings in content.pop(key, {}).items()}
-        for key in ("meaning", "settings"):
-            fields[key] = {role: str(text) for role, text in content.pop(key, {}).items()}
-        fields |= {"layered": _flag(content.pop("layered", False)), "cameras": str(content.pop("cameras", ""))}
-        fields |= {key: _texts(content.pop(key, ())) for key in ("main", "complete", "uncertain", "other_layers")}
-        fields["light"] = tuple(_signal(**one) for one in content.pop("light", ()))
-    except (AttributeError, TypeError, KeyError) as error:
-        raise SvgfError(f"{path}: {error!r} where a table of a renderer was read; see the ones in {FOLDER}.") from error
-    if content:
-        raise SvgfError(f"{path}: {', '.join(content)} not known; wanted {', '.join(Table._fields[1:])}.")
-    _check_meaning(path, fields["meaning"])
+    file = read_toml(path, "table of a renderer")
+    fields: dict[str, Any] = {"name": path.stem, "title": path.stem}
+    for key, value in file.content.items():
+        _require_known(file, key, Table._fields[1:], "a table of a renderer", key)
+        if key == "light":
+            fields[key] = tuple(_signal(file, i, one) for i, one in enumerate(_of_type(file, list, value, key)))
+        elif key in _NAMES:
+            table = _of_type(file, dict, value, key)
+            for name in table:
+                _require_known(file, name, _NAMES[key], f"[{key}]", key, name)
+            kind = str if key in ("meaning", "settings") else tuple
+            fields[key] = {name: _of_type(file, kind, one, key, name) for name, one in table.items()}
+        else:
+            kind = bool if key == "layered" else str if key in ("title", "cameras") else tuple
+            fields[key] = _of_type(file, kind, value, key)
+    _check_meaning(file, fields.get("meaning", {}))
+    lights = {signal.name for signal in fields.get("light", ())}
+    for key, known in (("complete", {*lights, *WIDTH}), ("uncertain", set(WIDTH))):
+        for name in fields.get(key, ()):
+            _require_known(file, name, sorted(known), key, key, what="light or role" if key == "complete" else "role")
+    cameras = fields.get("cameras", "header")
+    if cameras != "header" and "." not in cameras:
+        raise SvgfError(f"{place(file, 'cameras')}: cameras = {cameras!r}; wanted header, or the name of a file.")
     return Table(**fields)
 
 
-def _signal(name: str, channels: Any, albedo: Any = (), divided: bool = False) -> Signal:
-    return Signal(name, _texts(channels), _texts(albedo), _flag(divided))
+def _signal(file: TomlFile, index: int, value: Any) -> Signal:
+    """One [[light]]."""
+    for key in _of_type(file, dict, value, "light", index):
+        _require_known(file, key, Signal._fields, "[[light]]", "light", index, key)
+    for key in ("name", "channels"):
+        if key not in value:
+            raise SvgfError(
+                f"{place(file, 'light', index)}: [[light]] without {key!r}; wanted {', '.join(Signal._fields)}."
+            )
+    kinds = {"name": str, "channels": tuple, "albedo": tuple, "divided": bool}
+    given = {key: _of_type(file, kinds[key], one, "light", index, key) for key, one in value.items()}
+    return Signal(**({"albedo": (), "divided": False} | given))
 
 
-def _flag(value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise TypeError(f"got {value!r}, wanted true or false")
-    return value
+def _require_known(
+    file: TomlFile, name: str, known: Collection[str], where: str, *keys: str | int, what: str = "key"
+) -> None:
+    if name not in known:
+        near = ALIASES.get(name)
+        hint = f". Did you mean {near}?" if near in known else suggest(name, known)
+        raise SvgfError(f"{place(file, *keys)}: no {what} {name!r} in {where}{sentences(hint, known)}")
 
 
-def _check_meaning(path: Path, meaning: Mapping[str, str]) -> None:
-    known = {"depth": ("distance",), "normal": _SPACES, "position": _SPACES}
+def _of_type(file: TomlFile, kind: type, value: Any, *keys: str | int) -> Any:
+    """`value` if it is of this type; tuple: one text or a list of them. Raises SvgfError with its line."""
+    if kind is tuple and isinstance(value, str):
+        return (value,)
+    if kind is tuple and isinstance(value, list) and all(isinstance(one, str) for one in value):
+        return tuple(value)
+    if kind is not tuple and isinstance(value, kind):
+        return value
+    wanted = {tuple: "a text, or a list of texts", str: "a text", bool: "true or false", dict: "a table"}
+    name = ".".join(map(str, keys))
+    raise SvgfError(f"{place(file, *keys)}: {name} = {value!r}; wanted {wanted.get(kind, 'tables, [[light]]')}.")
+
+
+def _check_meaning(file: TomlFile, meaning: Mapping[str, str]) -> None:
+    spaces = ("camera", "camera z-back", "camera or world")
+    known = {"depth": ("distance",), "normal": spaces, "position": spaces}
     for role, text in meaning.items():
+        where = place(file, "meaning", role)
         if role == "motion":
-            parse_convention(text)
+            try:
+                parse_convention(text)
+            except SvgfError as error:
+                raise SvgfError(f"{where}: {error}") from None
         elif role == "id" and not text.lstrip("-").isdigit():
-            raise SvgfError(f"{path}: id means {text!r}; wanted the number that stands for no object.")
-        elif role != "id" and text not in known.get(role, ()):
-            wanted = ", ".join(known.get(role, ())) or "no meaning for this role"
-            raise SvgfError(f"{path}: {role} means {text!r}; wanted {wanted}.")
+            raise SvgfError(f"{where}: id means {text!r}; wanted the number that stands for no object.")
+        elif role != "id" and text not in known[role]:
+            raise SvgfError(f"{where}: {role} means {text!r}; wanted {', '.join(known[role])}.")
 
 
 def detect_renderer(channels: Collection[str], attributes: Iterable[str] = (), files: Collection[str] = ()) -> Table:
@@ -224,12 +293,3 @@ def find_file(role: str, globs: Iterable[str], patterns: Mapping[str, str], *, w
 
 def _like(name: str, pattern: str) -> bool:
     return fnmatchcase(name.lower(), pattern.lower())
-
-
-def _texts(value: Any) -> tuple[str, ...]:
-    """One text or a list of them."""
-    if isinstance(value, str):
-        return (value,)
-    if not all(isinstance(text, str) for text in value):
-        raise TypeError(f"got {value!r}, wanted texts")
-    return tuple(value)

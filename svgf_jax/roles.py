@@ -35,31 +35,8 @@ from collections.abc import Collection, Iterable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from svgf_jax.renderers import NATIVE, Signal, Table, pick
+from svgf_jax.renderers import ALIASES, NATIVE, WIDTH, Signal, Table, pick
 from svgf_jax.types import SvgfError
-
-WIDTH = {
-    "direct": 3,
-    "indirect": 3,
-    "radiance": 3,
-    "emission": 3,
-    "environment": 3,
-    "albedo": 3,
-    "normal": 3,
-    "depth": 1,
-    "motion": 2,
-    "id": 1,
-    "position": 3,
-    "hit_distance": 1,
-    "roughness": 1,
-    "alpha": 1,
-    "direct_variance": 1,
-    "indirect_variance": 1,
-    "radiance_variance": 1,
-}
-"""Number of channels of each role."""
-
-ALIASES = {"color": "radiance", "colour": "radiance", "beauty": "radiance", "object_id": "id"}
 
 _NATIVE = {
     "radiance": ("R G B",),

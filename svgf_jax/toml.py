@@ -33,12 +33,12 @@ def read_toml(path: Path, what: str) -> TomlFile:
         raise SvgfError(f"{path}: can't be read as text: {error}") from None
 
 
-def place(file: TomlFile, *keys: str) -> str:
-    """`FILE:LINE` where a key is given: ("params", "alpha") is `alpha` of the table [params]."""
+def place(file: TomlFile, *keys: str | int) -> str:
+    """`FILE:LINE` where a key is given: ("params", "alpha") is `alpha` of the table [params], ("light", 1) the second [[light]]."""
     return f"{file.path}:{line_of(file.text, *keys)}"
 
 
-def line_of(text: str, *keys: str) -> int:
+def line_of(text: str, *keys: str | int) -> int:
     """The line, from 1, where TOML `text` begins to give a key.
 
     The first lines are parsed, always more of them, until the key is there: no second parser, and right wherever tomllib is.
@@ -55,11 +55,12 @@ def line_of(text: str, *keys: str) -> int:
     return len(lines)
 
 
-def _has(content: Any, keys: tuple[str, ...]) -> bool:
-    for key in keys:
-        if not isinstance(content, dict) or key not in content:
-            return False
-        content = content[key]
+def _has(content: Any, keys: tuple[str | int, ...]) -> bool:
+    try:
+        for key in keys:
+            content = content[key]
+    except (KeyError, IndexError, TypeError):
+        return False
     return True
 
 

@@ -1,6 +1,4 @@
-"""Renderers that cannot be run here: tiny files written to their documented conventions. And the tables themselves."""
-
-import json
+"""Renderers that cannot be run here: tiny files written to their documented conventions."""
 
 import numpy as np
 import pytest
@@ -8,10 +6,7 @@ from test_renderers import H, W, planes, put
 
 from svgf_jax import SvgfError
 from svgf_jax.frames import open_source, read_frame
-from svgf_jax.motion import parse_convention
 from svgf_jax.references import read_radiance
-from svgf_jax.renderers import detect_renderer, load_table, renderer_names
-from svgf_jax.roles import WIDTH
 
 HALF = np.float16
 
@@ -267,136 +262,3 @@ def test_channels_of_other_renderers(tmp_path, name):
         assert (frame.radiance[-1] == values["rest"]).all()
     assert (frame.radiance.sum(0) + frame.emission == 3).all()
     assert (read_radiance(tmp_path / "a_1.exr") == 3).all()
-
-
-@pytest.mark.parametrize("name", renderer_names())
-def test_every_table_means_something(name):
-    table = load_table(name)
-    roles = set(WIDTH) | {f"camera_{role}" for role in WIDTH}
-    assert table.channels.keys() | table.files.keys() | table.meaning.keys() | table.settings.keys() <= roles
-    parse_convention(table.meaning.get("motion", ""))
-    assert set(table.complete) <= {signal.name for signal in table.light} | set(WIDTH)
-    assert table.title
-    if name != "native":
-        assert table.detect
-
-
-def test_native_names_are_native_and_nothing_is_nobody():
-    assert detect_renderer(["direct.R", "N.X", "Z"]).name == "native"
-    assert detect_renderer(["R", "G", "B", "A"]).name == "native"
-    assert detect_renderer(["normal.X", "normal.Y", "normal.Z", "R", "mse.R"]).name == "native"
-
-
-def test_a_table_of_ones_own(tmp_path):
-    path = tmp_path / "studio.toml"
-    path.write_text(
-        'title = "Ours"\n[channels]\nmotion = ["*.flow.XY"]\nnormal = ["Nn.xyz"]\n[meaning]\nmotion = "ndc"\n'
-    )
-    channels = planes("", 1) | planes("lgt.flow", [0.5, 0.5], "XY") | planes("Nn", [0, 0, 2], "xyz")
-    folder = put(tmp_path / "in", channels, "a_1.exr")
-    source = open_source(folder, renderer=str(path))
-    assert source.roles.renderer == "studio"
-    frame = read_frame(source, 0).frame
-    assert frame.motion[0, 0].tolist() == [W / 4, H / 4]
-    put(folder, channels | planes("key.flow", 0, "XY"), "a_1.exr")
-    with pytest.raises(
-        SvgfError, match=r"several channels may be motion: .*key\.flow\.X,key\.flow\.Y.*--channel motion="
-    ):
-        open_source(folder, renderer=str(path))
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[channels]\nalbedo = 3\n", "where a table of a renderer was read"),
-        ("chanels = 3\n", "chanels not known; wanted title, detect"),
-        ("[[light]]\nchannels = ['a']\n", "missing 1 required positional argument: 'name'"),
-        ("[[light]]\nname = 'a'\nchannels = ['a']\nalbdo = 'b'\n", "unexpected keyword argument 'albdo'"),
-        ("layered = 'false'\n", "got 'false', wanted true or false"),
-        ('[meaning]\nid = "none"\n', "id means 'none'; wanted the number"),
-        ('[meaning]\nnormal = "view"\n', "normal means 'view'; wanted camera, camera z-back, camera or world"),
-        ('[meaning]\nalbedo = "sRGB"\n', "albedo means 'sRGB'; wanted no meaning for this role"),
-        ('[meaning]\nmotion = "up"\n', "'up' is not known; wanted one each"),
-        ("a = \n", r"mine\.toml:1: not TOML"),
-    ],
-)
-def test_tables_that_are_wrong(tmp_path, text, message):
-    (tmp_path / "mine.toml").write_text(text)
-    with pytest.raises(SvgfError, match=message):
-        load_table(str(tmp_path / "mine.toml"))
-
-
-def test_renderers_that_are_not_known():
-    with pytest.raises(SvgfError, match=r"no renderer is called 'blender'; there are native, arnold, bmfr, cycles"):
-        load_table("blender")
-
-
-def native(number, **more):
-    channels = planes("", 1) | planes("depth", 4, "Z") | planes("normal", [0, 0, -1], "XYZ")
-    return channels | more
-
-
-def camera_file(folder, numbers):
-    """Cameras that go to the right by 0.1 a frame."""
-
-    screen = [[10, 0, W / 2, 0], [0, 10, H / 2, 0], [0, 0, 1, -0.1], [0, 0, 1, 0]]
-    entries = []
-    for number in numbers:
-        matrix = np.eye(4)
-        matrix[0, 3] = -0.1 * number
-        entries.append({"frame": number, "world_to_camera": matrix.tolist(), "camera_to_screen": screen})
-    (folder / "cameras.json").write_text(json.dumps({"per_frame": entries}))
-
-
-@pytest.mark.parametrize("words", ["world", "world from-previous"])
-def test_motion_in_world_space(tmp_path, words):
-    sign = -1 if "from" in words else 1
-    for number in (0, 1):
-        put(tmp_path, native(number) | planes("motion", [0.2 * sign, 0, 0.4 * sign], "XYZ"), f"frame_{number}.exr")
-    with pytest.raises(SvgfError, match="motion in world space needs cameras, and positions or depth"):
-        open_source(tmp_path, motion=words)
-    camera_file(tmp_path, [0, 1])
-    source = open_source(tmp_path, motion=words)
-    frame = read_frame(source, 1).frame
-    x = (2.5 - W / 2) * 4 / 10  # of the point seen at pixel 2, in camera space; the camera before was 0.1 further left
-    np.testing.assert_allclose(frame.motion[0, 2, 0], 10 * (x + 0.1 + 0.2) / 4.4 + W / 2 - 2.5, rtol=1e-5)
-    np.testing.assert_allclose(frame.prev_depth, 4.4, rtol=1e-6)
-    assert not read_frame(source, 0).frame.motion.any()
-
-
-def test_motion_that_stands_in_the_frame_before(tmp_path):
-    for number in (0, 1, 2):
-        put(tmp_path, native(number) | planes("motion", [number + 1, 0], "XY"), f"frame_{number}.exr")
-    source = open_source(tmp_path, motion="to-next")
-    assert [read_frame(source, i).frame.motion[0, 0, 0] for i in range(3)] == [0, -1, -2]
-    held = open_source(tmp_path, motion="to-next", frames="0,2")
-    assert not read_frame(held, 1).frame.motion.any()
-
-
-def test_depth_along_the_ray_becomes_z(tmp_path):
-    y, x = np.mgrid[:H, :W]
-    along = np.sqrt(1 + ((x + 0.5 - W / 2) / 10) ** 2 + ((y + 0.5 - H / 2) / 10) ** 2)
-    far = planes("", 1) | {"dist.T": (4 * along).astype(np.float32), "nn.X": 0 * x.astype(np.float32)}
-    far |= {"nn.Y": far["nn.X"], "nn.Z": far["nn.X"] - 1}
-    put(tmp_path, far, "frame_0.exr")
-    camera_file(tmp_path, [0])
-    frame = read_frame(open_source(tmp_path, renderer="mitsuba"), 0).frame
-    np.testing.assert_allclose(frame.depth, 4, rtol=1e-6)
-
-
-def test_normals_in_camera_space_come_to_the_world(tmp_path):
-    """Camera turned about y; a table says where its z points."""
-    turn = rotation(0.3)
-    entry = {"frame": 0, "world_to_camera": turn.tolist()}
-    entry["camera_to_screen"] = [[10, 0, W / 2, 0], [0, 10, H / 2, 0], [0, 0, 1, -0.1], [0, 0, 1, 0]]
-    wanted = np.array([0.6, -0.48, -0.64])
-    for words, sign in (("camera", 1), ("camera z-back", -1)):
-        mine = (turn[:3, :3] @ wanted) * [1, -1, sign]  # y up
-        folder = put(tmp_path / str(sign), native(0) | planes("normal", mine, "XYZ"), "frame_0.exr")
-        (folder / "cameras.json").write_text(json.dumps({"per_frame": [entry]}))
-        (tmp_path / "mine.toml").write_text(f'[meaning]\nnormal = "{words}"\n')
-        table = str((tmp_path / "mine.toml").rename(tmp_path / f"mine{sign}.toml"))
-        frame = read_frame(open_source(folder, renderer=table), 0).frame
-        np.testing.assert_allclose(frame.normal, np.broadcast_to(wanted, (H, W, 3)), atol=1e-6)
-        (told,) = [text for text in open_source(folder, renderer=table, cameras=None).warnings if "space" in text]
-        assert told.startswith("normals are in camera space, and no camera is known")
