@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, NoReturn
 
 from cyclopts import App, CycloptsError, Group, Parameter
 
-from svgf_jax import __version__
+from svgf_jax import __version__, limits
 from svgf_jax.commands import terminal
 from svgf_jax.commands.ablate import ablate
 from svgf_jax.commands.compare import compare
@@ -60,17 +60,21 @@ def completion(shell: Literal["bash", "zsh", "fish", "powershell"], /, *, instal
 def launch(
     *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
     config: Annotated[str, Parameter(metavar="FILE", group=Group("Project", sort_key=9))] = "auto",
+    max_pixels: Annotated[int | None, Parameter(metavar="COUNT", group=Group("Project", sort_key=9))] = None,
 ) -> Any:
     """Run a command with the project's file behind it.
 
     Args:
         config: Flags of this project, a table for each command; auto takes the nearest svgf-jax.toml, none ignores it.
+        max_pixels: Read pictures of up to so many pixels (268435456 if not given), however small their files.
     """
     use_project(app, config, tables=(*(name for name in app if not name.startswith("-")), *OTHERS))
+    limits.set_max_pixels(max_pixels)
     try:
         return app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
     finally:
         app.config = ()
+        limits.set_max_pixels(None)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -2,28 +2,31 @@
 
 What is guarded against: arrays that are not C-contiguous (written wrong, silently), pixel data that is cut off or
 corrupt (no exception), dictionaries replaced or emptied behind the caller's back, `Path` taken for a stream, layers
-merged, deep and subsampled data, sizes that no memory holds, half-written output. Data and display window are kept
-apart and written back.
+merged, deep and subsampled data, sizes that no memory holds, warnings printed to the standard output, half-written output.
+Data and display window are kept apart and written back.
 
 Reading and writing may be called from several threads at once.
 """
 
 import os
 import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from os import fspath
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from svgf_jax import atomic
-from svgf_jax.exr_layout import Part, PathName, Window, read_layout
+from svgf_jax import atomic, limits, prints
+from svgf_jax.exr_chunks import check_chunks, check_size
+from svgf_jax.exr_layout import Layout, Part, PathName, Window, read_layout
 from svgf_jax.types import SvgfError
 
-MAX_PIXELS = 2**28
-OLDEST_OPENEXR = (3, 4, 14)
+OLDEST_OPENEXR = (3, 5, 3)
+"""The first that mends every flaw known when this was written: https://github.com/AcademySoftwareFoundation/openexr/releases."""
 COMPRESSIONS = ("none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab")
 
 _STRUCTURAL = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name", "preview"}
@@ -73,43 +76,44 @@ def new_image(
     return Image(channels, window, window, dict(attributes or {}))
 
 
-def read_header(path: PathName) -> Header:
+def read_header(path: PathName, *, max_pixels: int | None = None) -> Header:
     """Names, types, windows and attributes of a file, in about a millisecond. Raises SvgfError as `read` does."""
     path = fspath(path)
-    parts = read_layout(path)
-    _check_parts(path, parts, MAX_PIXELS)
-    file = _open(path, header_only=True)
+    with _opened(path, max_pixels) as (file, layout):
+        opened = _open(path, file, header_only=True)
+    parts = layout.parts
     types = {full: parts[i].channels[name].dtype for (i, name), full in _merged_names(parts).items()}
     first = parts[0]
-    attributes = _attributes(file)
     names = tuple(part.name for part in parts)
-    return Header(types, first.data_window, first.display_window, attributes, names, first.compression)
+    return Header(types, first.data_window, first.display_window, _attributes(opened), names, first.compression)
 
 
-def read(path: PathName, *, max_pixels: int = MAX_PIXELS) -> Image:
-    """All channels of a file, tiled or scanline, one part or several.
+def read(path: PathName, *, max_pixels: int | None = None) -> Image:
+    """All channels of a file, tiled or scanline, one part or several; of mip and rip maps the picture itself.
 
-    Raises SvgfError: missing, empty, not an EXR, cut off or corrupt, deep, subsampled, parts of different size, or
-    more than `max_pixels` pixels (checked before anything is allocated).
+    Raises SvgfError: missing, empty, not an EXR, cut off or corrupt, deep, subsampled, parts of different size, more than
+    `max_pixels` pixels, or, where those are not given (here or to `limits`), more than its bytes are likely to hold. All of
+    this is checked before anything is allocated.
     """
     path = fspath(path)
-    parts = read_layout(path)
-    _check_parts(path, parts, max_pixels)
-    file = _open(path, header_only=False)
-    if len(file.parts) != len(parts):  # the library drops a part that it cannot decode, and says nothing
-        raise SvgfError(
-            f"{path}: the pixel data is corrupt ({len(file.parts)} of {len(parts)} parts decoded). "
-            "Render or copy this frame again."
-        )
-    left, top, right, bottom = parts[0].data_window
-    shape = (bottom - top + 1, right - left + 1)
+    with _opened(path, max_pixels) as (file, layout):
+        check_chunks(file, path, layout)
+        with prints.kept() as printed:
+            opened = _open(path, file, header_only=False)
+    parts = layout.parts
+    if len(opened.parts) != len(parts):  # the library drops a part that it cannot decode, and prints a warning
+        told = re.sub(r".* - |Error reading pixel data from image file \S+ ", "", "".join(printed)).strip()[:200]
+        why = told or f"{len(opened.parts)} of {len(parts)} parts decoded"
+        raise SvgfError(f"{path}: the pixel data is corrupt ({why}). Render or copy this frame again.")
+    shape = parts[0].size[::-1]
     channels = {}
     for (i, name), full in _merged_names(parts).items():
-        pixels = file.channels(i)[name].pixels
-        if pixels.shape != shape or pixels.dtype.name not in _PIXEL_TYPES:
+        channel = opened.channels(i).get(name)
+        pixels = np.empty(0) if channel is None else channel.pixels
+        if pixels.shape != shape or pixels.dtype != parts[i].channels[name].dtype:
             raise SvgfError(f"{path}: channel {name!r} came as {pixels.dtype} {pixels.shape}; wanted {shape}.")
         channels[full] = pixels
-    return Image(channels, parts[0].data_window, parts[0].display_window, _attributes(file))
+    return Image(channels, parts[0].data_window, parts[0].display_window, _attributes(opened))
 
 
 def write(path: PathName, image: Image, *, compression: str = "zip") -> tuple[str, ...]:
@@ -133,7 +137,8 @@ def write(path: PathName, image: Image, *, compression: str = "zip") -> tuple[st
     try:
         with atomic.replacing(path) as temporary:
             bindings.File(header, channels).write(str(temporary))
-            read_layout(temporary)  # a full disk need not have raised
+            with _opened(str(temporary), image.channels[next(iter(channels))].size):  # a full disk need not have raised
+                pass
     except (OSError, RuntimeError, ValueError, TypeError, SvgfError) as error:
         reason = _write_failure(path, error)
         raise SvgfError(f"{path}: cannot be written ({reason}). Is the disk full or the folder read-only?") from error
@@ -153,7 +158,7 @@ def _bindings() -> ModuleType:
         import OpenEXR
     except ImportError as error:
         raise SvgfError(
-            f"the OpenEXR bindings cannot be imported ({error}); try: pip install 'OpenEXR>=3.4.14'"
+            f"the OpenEXR bindings cannot be imported ({error}); try: pip install 'OpenEXR>={_text(OLDEST_OPENEXR)}'"
         ) from error
     _check_version(OpenEXR.__version__)
     # Version 3.5 decodes and encodes on one thread unless told otherwise; a host program's own choice is left alone.
@@ -165,34 +170,59 @@ def _bindings() -> ModuleType:
 def _check_version(version: str) -> None:
     numbers = tuple(int(digits) for digits in re.findall(r"\d+", version)[:3])
     if numbers < OLDEST_OPENEXR:
-        oldest = ".".join(map(str, OLDEST_OPENEXR))
         raise SvgfError(
-            f"OpenEXR {version} is installed; wanted {oldest} or later, which reads damaged files safely. "
-            "Try: pip install -U OpenEXR"
+            f"OpenEXR {version} is installed; wanted {_text(OLDEST_OPENEXR)} or later, which mends known ways to attack a "
+            "program through a picture. Try: pip install -U OpenEXR"
         )
 
 
-def _open(path: str, *, header_only: bool) -> Any:
-    """An OpenEXR.File, never in a `with` block: leaving one empties the dictionaries of headers and channels."""
+def _text(version: tuple[int, ...]) -> str:
+    return ".".join(map(str, version))
+
+
+@contextmanager
+def _opened(path: str, max_pixels: int | None) -> Iterator[tuple[BinaryIO, Layout]]:
+    """A file that may be read, by its header, and its layout. Raises SvgfError."""
     try:
-        return _bindings().File(path, separate_channels=True, header_only=header_only)
-    except (RuntimeError, ValueError, TypeError, MemoryError) as error:
-        raise SvgfError(f"{path}: OpenEXR cannot read this file ({error}). Render or copy it again.") from error
+        if os.path.isdir(path):
+            raise SvgfError(f"{path}: this is a folder; wanted one EXR file.")
+        with open(path, "rb") as file:
+            layout = read_layout(file, path, os.fstat(file.fileno()).st_size)
+            most, chosen = limits.max_pixels() if max_pixels is None else (max_pixels, True)
+            _check_parts(path, layout.parts, most)
+            if not chosen:
+                check_size(path, layout)
+            yield file, layout
+    except OSError as error:
+        raise SvgfError(f"{path}: cannot be read ({error.strerror or error}).") from error
 
 
-def _check_parts(path: str, parts: list[Part], max_pixels: int) -> None:
+def _open(path: str, file: BinaryIO, *, header_only: bool) -> Any:
+    """An OpenEXR.File, never in a `with` block: leaving one empties the dictionaries of headers and channels.
+
+    It is opened by its descriptor, where that has a name: it is then the file that was checked, whatever has been put in its
+    place since, and what the library may print holds no name that somebody else chose.
+    """
+    name = f"/proc/self/fd/{file.fileno()}"
+    name = name if os.path.exists(name) else path
+    try:
+        return _bindings().File(name, separate_channels=True, header_only=header_only)
+    except (RuntimeError, ValueError, TypeError, MemoryError, UnicodeError) as error:
+        why = str(error).replace(name, path)[:300]
+        raise SvgfError(f"{path}: OpenEXR cannot read this file ({why}). Render or copy it again.") from error
+
+
+def _check_parts(path: str, parts: Sequence[Part], max_pixels: int) -> None:
     windows = {part.data_window for part in parts}
     if len(windows) > 1:
         raise SvgfError(
             f"{path}: its parts have different data windows {sorted(windows)}; wanted one. Write a file per part."
         )
-    left, top, right, bottom = parts[0].data_window
-    width, height = right - left + 1, bottom - top + 1
-    if width < 1 or height < 1:
-        raise SvgfError(f"{path}: its data window {parts[0].data_window} holds no pixels.")
+    width, height = parts[0].size
     if width * height > max_pixels:
         raise SvgfError(
-            f"{path}: {width} x {height} pixels; wanted at most {max_pixels}. Crop or split it, or raise max_pixels."
+            f"{path}: {width} x {height} pixels; wanted at most {max_pixels}. Crop or split it, or raise max_pixels "
+            "(--max-pixels)."
         )
     for part in parts:
         if "deep" in part.kind:
@@ -206,7 +236,7 @@ def _check_parts(path: str, parts: list[Part], max_pixels: int) -> None:
                 )
 
 
-def _merged_names(parts: list[Part]) -> dict[tuple[int, str], str]:
+def _merged_names(parts: Sequence[Part]) -> dict[tuple[int, str], str]:
     """Full name by (part, channel name): the channel's own, with the part's in front where several parts use it."""
     uses: dict[str, int] = {}
     for part in parts:

@@ -9,6 +9,7 @@ import os
 import warnings
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,7 +39,7 @@ class Source(NamedTuple):
         cameras: from cameras.json, if there is one.
         data_window, display_window: of the first frame; every frame must have the same.
         warnings: what the user should know before the work starts, as sentences.
-        max_pixels: largest picture that will be read.
+        max_pixels: largest picture that will be read, if not that of `svgf_jax.limits`.
         position: whether frames get their `Frame.position`.
         table: the renderer's table (`svgf_jax.renderers`).
     """
@@ -51,7 +52,7 @@ class Source(NamedTuple):
     data_window: Window
     display_window: Window
     warnings: tuple[str, ...]
-    max_pixels: int
+    max_pixels: int | None
     position: bool = False
     table: renderers.Table = renderers.NATIVE
 
@@ -90,7 +91,7 @@ def open_source(
     layer: str | None = None,
     motion: str | None = None,
     position: bool = False,
-    max_pixels: int = exr.MAX_PIXELS,
+    max_pixels: int | None = None,
 ) -> Source:
     """Find the files of a sequence and settle the roles by the first frame's header; no pixel is read.
 
@@ -109,7 +110,7 @@ def open_source(
         motion: what the motion vectors mean, in place of what the renderer's table says: words of `svgf_jax.motion`.
         position: also give each frame its world positions, which the joint bilateral filter reads: the renderer's, or from
             depth and cameras.
-        max_pixels: refuse larger pictures.
+        max_pixels: refuse larger pictures; those of more than 2**28 pixels if None.
 
     Raises SvgfError: whatever is missing or unclear, naming the file.
     """
@@ -117,12 +118,13 @@ def open_source(
     meaning = {} if motion is None else {"motion": str(parse_convention(motion))}
     sequence = _find_frames(pattern, table, frames=frames, missing=missing, warmup=warmup)
     at, path = next((i, path) for i, (_, path) in enumerate(sequence.files) if path is not None)
-    header = exr.read_header(path)
+    read_header = partial(exr.read_header, max_pixels=max_pixels)
+    header = read_header(path)
     there = patterns(os.path.dirname(path))
     table = table or renderers.detect_renderer(header.channels, header.attributes, tuple(there))
     channels = renderers.in_layer(table, tuple(header.channels), layer, where=path)
     files = {canonical_role(role): companion(sequence, where) for role, where in (file or {}).items()}
-    own = {role: (str(other.files[at][1]), exr.read_header(str(other.files[at][1]))) for role, other in files.items()}
+    own = {role: (str(other.files[at][1]), read_header(str(other.files[at][1]))) for role, other in files.items()}
 
     def settle(found: Iterable[str] = ()) -> Roles:
         names = {role: (name, tuple(other.channels)) for role, (name, other) in own.items()}
@@ -137,7 +139,7 @@ def open_source(
             near[role] = where
     if near:
         files |= {role: companion(sequence, where) for role, where in near.items()}
-        own |= {role: (str(files[role].files[at][1]), exr.read_header(str(files[role].files[at][1]))) for role in near}
+        own |= {role: (str(files[role].files[at][1]), read_header(str(files[role].files[at][1]))) for role in near}
         roles = settle(near)
     files = {role: other for role, other in files.items() if role in roles.layers}
     found = find_cameras(cameras, sequence, header, path, elsewhere=table.cameras)

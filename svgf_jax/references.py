@@ -16,7 +16,7 @@ NAMES = ("ref", "reference", "frame")
 """What the sequence of references in a folder may be called, the most likely first."""
 
 
-def read_radiance(path: PathName, *, max_pixels: int = exr.MAX_PIXELS) -> np.ndarray:
+def read_radiance(path: PathName, *, max_pixels: int | None = None) -> np.ndarray:
     """Total radiance `[H, W, 3]` float32: R, G, B where the file has them, else the renderer's beauty, else all light added up.
 
     Raises SvgfError: unreadable, or nothing of this is there.

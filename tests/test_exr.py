@@ -325,10 +325,10 @@ def test_missing_folder_is_named(tmp_path):
 
 
 def test_an_old_openexr_is_refused():
-    exr._check_version("3.4.14")
+    exr._check_version("3.5.3")
     exr._check_version("4.0.0-dev")
-    for version in "3.4.13", "3.3.9", "2.9":
-        with pytest.raises(SvgfError, match=rf"OpenEXR {version} is installed; wanted 3\.4\.14 or later"):
+    for version in "3.5.2", "3.4.17", "2.9":
+        with pytest.raises(SvgfError, match=rf"OpenEXR {version} is installed; wanted 3\.5\.3 or later"):
             exr._check_version(version)
 
 

@@ -7,11 +7,11 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    {"atomic", "remedies"},
+    {"atomic", "prints", "remedies"},
     {"types"},
-    {"tonemapping", "toml"},
+    {"limits", "tonemapping", "toml"},
     {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments", "motion"},
-    {"windows", "noise"},
+    {"windows", "noise", "exr_chunks"},
     {
         "methods",
         "edges",
@@ -57,6 +57,7 @@ NUMPY_ONLY = {
     "parameters",
     "metrics",
     "exr_layout",
+    "exr_chunks",
     "exr",
     "sequences",
     "cameras",
