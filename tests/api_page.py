@@ -26,7 +26,7 @@ GROUPS = {
         "Other filters": ["joint_bilateral", "methods", "baselines"],
         "Samples of a pixel": ["moments"],
     },
-    "tune": {"Tuning": ["fitting", "shots", "evaluate", "residuals", "knowledge"]},
+    "tune": {"Tuning": ["fitting", "shots", "targets", "evaluate", "residuals", "knowledge"]},
 }
 WIDTH = 110  # of a signature that stays on a line
 HEAD = """# API reference

@@ -147,11 +147,16 @@ def test_worse_validation_is_an_error_and_loses_nothing(tuned):
     assert (folder / "tuned.toml").exists()
 
 
-@pytest.mark.parametrize(("accept", "code"), [([], 1), (["--accept"], 0)])
-def test_worse_validation_can_be_accepted(accept, code, shots, tmp_path, monkeypatch):
-    found = types.SimpleNamespace(result="converged")
+@pytest.mark.parametrize(
+    ("accept", "worse", "diverged", "code"),
+    [([], 1, False, 1), (["--accept"], 1, False, 0), ([], 0, True, 1), (["--accept"], 0, True, 1)],
+)
+def test_worse_validation_can_be_accepted_a_lost_solver_not(
+    accept, worse, diverged, code, shots, tmp_path, monkeypatch
+):
+    found = types.SimpleNamespace(result="converged", diverged=diverged)
     monkeypatch.setattr("tune.fitting.fit", lambda *_, **__: found)
-    monkeypatch.setattr("tune.telling.conclude", lambda *_, **__: 1)
+    monkeypatch.setattr("tune.telling.conclude", lambda *_, **__: worse)
     with pytest.raises(SystemExit) as left:
         main([str(shots), "--reference", str(shots), "-o", str(tmp_path / "t.toml"), *accept])
     assert left.value.code == code

@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -209,6 +210,27 @@ def test_interrupted_between_trial_points_it_returns_the_best_so_far():
     assert fit.result.startswith("interrupted")
     assert len(fit.iterations) == 3
     assert fit.loss < 1
+
+
+def test_a_solver_that_loses_its_way_is_told_by_the_result_and_the_best_is_kept(monkeypatch):
+    advance = solvers.advance
+
+    def astray(descent, triangle):
+        descent, accepted = advance(descent, triangle)
+        if len(seen) == 2:
+            state = eqx.tree_at(lambda state: state.y_eval, descent.state, jnp.full(3, jnp.nan))
+            descent = descent._replace(state=state)
+        seen.append(descent)
+        return descent, accepted
+
+    seen = []
+    monkeypatch.setattr(solvers, "advance", astray)
+    fit = tune.fit(START, CONFIG, [shot()], TERMS, names=NAMES, least_gain=0)
+    assert (fit.diverged, fit.converged, len(fit.iterations)) == (True, False, 3)
+    assert "--solver lm" in fit.result
+    assert fit.loss == min(i.loss for i in fit.iterations) < 1
+    assert np.isfinite(fit.y).all()
+    np.testing.assert_array_equal([getattr(fit.params, name) for name in NAMES], fit.iterations[-1].values)
 
 
 def test_holes_in_the_data_count_for_nothing():

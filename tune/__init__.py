@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from tune.shots import Shot as Shot
     from tune.shots import shot_of_arrays as shot_of_arrays
     from tune.shots import shot_of_files as shot_of_files
+    from tune.targets import Likeness as Likeness
+    from tune.targets import doubts as doubts
+    from tune.targets import likeness as likeness
 
 _HOME = {
     "evaluate": ["Measured", "measure"],
@@ -30,6 +33,7 @@ _HOME = {
     "knowledge": ["Knowledge"],
     "residuals": ["NOISY", "REFERENCE", "Term", "noisy_terms", "reference_terms"],
     "shots": ["Example", "Shot", "shot_of_arrays", "shot_of_files"],
+    "targets": ["Likeness", "doubts", "likeness"],
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 

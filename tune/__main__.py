@@ -38,7 +38,7 @@ def launch(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run and exit: 0; 1 if a validation sequence got worse; 2 for an error that its message explains; 130 interrupted."""
+    """Run and exit: 0; 1 if a validation sequence got worse or the solver lost its way; 2 for an error; 130 interrupted."""
     try:
         code = app.meta(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:

@@ -49,14 +49,14 @@ def save(path: Path, progress: Progress, identity: dict[str, Any]) -> None:
 def load(path: Path, fresh: Descent, identity: dict[str, Any]) -> Progress:
     """The progress that `path` holds; `fresh` is a descent of the same solver and size, just begun.
 
-    Raises SvgfError: not there, damaged, or of another fit than `identity`.
+    Raises SvgfError: not there, damaged, of another version, or of another fit than `identity`.
     """
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             content = {name: stored[name] for name in stored.files}
         header = json.loads(str(content["header"]))
         if header["format"] != FORMAT:
-            raise SvgfError(f"{path}: written by another version; start anew without --resume")
+            raise SvgfError(f"{path}: written by another version of svgf-tune; start anew without --resume")
         _compare(path, header["identity"], json.loads(json.dumps(identity)))
         trials = zip(content["trials"], content["values"], strict=True)
         return Progress(
@@ -75,14 +75,27 @@ def load(path: Path, fresh: Descent, identity: dict[str, Any]) -> Progress:
         )
     except FileNotFoundError:
         raise SvgfError(f"{path}: no checkpoint to resume from; start without --resume") from None
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        EOFError,
+        MemoryError,
+        zipfile.BadZipFile,
+    ) as error:
         raise SvgfError(f"{path}: damaged ({error}); delete it and start without --resume") from None
 
 
 def _compare(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None:
-    for key in stored.keys() | wanted.keys():
-        if stored.get(key) != wanted.get(key):
+    """SvgfError naming the first difference."""
+    for key in sorted(stored.keys() | wanted.keys()):
+        then, now = stored.get(key), wanted.get(key)
+        if isinstance(then, list) and isinstance(now, list) and len(then) == len(now):
+            then, now = next(((a, b) for a, b in zip(then, now, strict=True) if a != b), (None, None))
+        if then != now:
             raise SvgfError(
-                f"{path}: belongs to another fit: its {key} was {stored.get(key)!r}, now it is {wanted.get(key)!r}. "
-                "Give the same options, or start anew without --resume."
+                f"{path}: belongs to another fit: its {key} was {then!r}, now it is {now!r}. "
+                "Give the same options and files, or start anew without --resume."
             )

@@ -133,11 +133,13 @@ def command(
         require_flip()
 
     import tune.checkpoint as checkpoints
+    from svgf_jax.plan import stamp
     from tune import residuals
     from tune.fitting import fit
     from tune.free import TUNED_BY_DEFAULT, choose
     from tune.shots import shot_of_files
-    from tune.telling import conclude, live
+    from tune.targets import with_doubts
+    from tune.telling import conclude, live, versions
 
     references = [shot_of_files(n, r, frames=frames, **reading) for n, r in zip(noisy, reference, strict=False)]
     seconds = [
@@ -147,6 +149,7 @@ def command(
         shot_of_files(n, r, frames=validate_frames, **reading)
         for n, r in zip(validate, validate_reference, strict=True)
     ]
+    references, seconds, held = (list(map(with_doubts, group)) for group in (references, seconds, held))
     shots: list[Shot] = seconds or references
     if second:
         terms = residuals.noisy_terms(temporal=temporal, **({} if prior is None else {"prior_weight": prior}))
@@ -171,8 +174,10 @@ def command(
         "starts": starts,
         "choices": [str(choice) for choice in config],
         "reading": [channel, file, cameras, renderer, layer, motion],
+        "files": [stamp(path) for shot in shots for path in shot.paths],
+        "versions": versions(),
     }
-    terminal.warn(note for shot in (*shots, *held) for note in shot.notes)
+    terminal.warn(dict.fromkeys(note for shot in (*references, *seconds, *held) for note in shot.notes))
     length = sum(shot.length for shot in shots)
     with _terminated_as_interrupted(), live(len(shots), length, labels) as on_iteration:
         found = fit(
@@ -217,6 +222,8 @@ def command(
         terminal.tell(f"interrupted; go on with the same command and --resume ({checkpoint.name})")
         return 130
     checkpoint.unlink(missing_ok=True)
+    if found.diverged:
+        return 1
     if code and accept:
         terminal.tell("accepted all the same (--accept)")
         return 0

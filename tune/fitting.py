@@ -14,6 +14,7 @@ from tune.shots import Shot
 from tune.sweep import Problem, Sweep, pose, pull, sweep
 
 _INTERRUPTED = "interrupted; this is the best so far"
+_DIVERGED = "the solver has lost its way; this is the best so far"
 PATIENCE = 6  # trial points rejected in a row: the loss has nothing left that its derivatives know of
 
 
@@ -90,6 +91,11 @@ class Fit(NamedTuple):
     knowledge: Knowledge | None
     notes: tuple[str, ...]
 
+    @property
+    def diverged(self) -> bool:
+        """Whether the best start's solver came to ask about a point that is no number."""
+        return self.result.startswith(_DIVERGED)
+
 
 def fit(
     params: Params,
@@ -131,7 +137,8 @@ def fit(
     A KeyboardInterrupt ends the fit with the best so far, once there is one.
 
     Raises:
-        SvgfError: nothing to tune, frames that cannot be read, an error that cannot be lowered because it is not a number.
+        SvgfError: nothing to tune, frames that cannot be read, an error at the start that is not a number. A solver that
+            diverges later is no exception: `Fit.diverged` says so, and the best point is kept.
     """
     coordinates = choose(params, config, names=names, per_level=per_level, freeze=freeze)
     if least_gain is None:
@@ -217,7 +224,7 @@ def _ending(
     if len(rejected) == PATIENCE and not any(i.accepted for i in rejected):
         return f"converged: no step lowers the loss any more ({PATIENCE} tried, ever shorter)"
     if not np.isfinite(descent.trial).all():
-        return "the solver has lost its way; try --solver lm, another start, or fewer parameters (--freeze)"
+        return f"{_DIVERGED}. Try --solver lm, another start, or fewer parameters (--freeze)"
     if len(mine) + 1 >= max_steps:
         return f"not converged in {max_steps} trial points; raise --max-steps, or go on from this result (--params)"
     return None

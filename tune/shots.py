@@ -25,6 +25,7 @@ class Shot(NamedTuple):
         read: index -> `Example` of NumPy arrays; called from other threads, and anew for each pass.
         notes: what the user should know before the work starts, as sentences.
         numbers: of the frames, as their files have them; () = from 0 on.
+        paths: of all files of frames and targets, in order.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Shot(NamedTuple):
     read: Callable[[int], Example]
     notes: tuple[str, ...] = ()
     numbers: tuple[int, ...] = ()
+    paths: tuple[str, ...] = ()
 
 
 def frame_numbers(shot: Shot) -> tuple[int, ...]:
@@ -86,7 +88,9 @@ def shot_of_files(
             return Example(frame, None)
         return Example(frame, read_reference(path, size=frame.depth.shape, number=numbers[index]))
 
-    return Shot(str(noisy), len(numbers), read, (*source.warnings, *lacking), tuple(numbers))
+    files = [path for _, path in source.sequence.files if path is not None]
+    notes = (*source.warnings, *lacking)
+    return Shot(str(noisy), len(numbers), read, notes, tuple(numbers), (*files, *paths.values()))
 
 
 def window(shot: Shot, *, rows: slice = slice(None), columns: slice = slice(None), frames: slice = slice(None)) -> Shot:

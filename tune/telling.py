@@ -112,8 +112,7 @@ def conclude(
     assert found.knowledge is not None
     record = record | {
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": {name: importlib.metadata.version(name) for name in ("jax", "optimistix")}
-        | {"svgf_jax": __version__},
+        "versions": versions(),
         "result": found.result,
         "loss": float(found.loss),
         "tuned": list(found.coordinates.labels),
@@ -157,6 +156,11 @@ def conclude(
             f"VALIDATION GOT WORSE: {failure}. Tune on more sequences, fewer numbers, or with a larger --prior."
         )
     return 1 if failures else 0
+
+
+def versions() -> dict[str, str]:
+    """What a fit was computed by."""
+    return {name: importlib.metadata.version(name) for name in ("jax", "optimistix")} | {"svgf_jax": __version__}
 
 
 def summary(found: Fit, compared: Sequence[Comparison], curves: Sequence[Profile] = ()) -> dict[str, Any]:

@@ -1,0 +1,144 @@
+"""What must not mislead a fit: targets of something else, and checkpoints of another fit. NumPy only."""
+
+import json
+
+import numpy as np
+import pytest
+
+from svgf_jax import SvgfError
+from svgf_jax.demo import sample
+from tune import checkpoint
+from tune.shots import Example, Shot, shot_of_files
+from tune.targets import doubts, likeness, with_doubts
+
+
+@pytest.fixture(scope="module")
+def shot():
+    """Five frames of the bundled sample, read once."""
+    shot = shot_of_files(str(sample()), str(sample()), frames="0-4")
+    examples = [shot.read(i) for i in range(shot.length)]
+    return shot._replace(read=lambda i: examples[i])
+
+
+def changed(shot, change):
+    """The shot with `change(target, index)` for its targets."""
+    return shot._replace(read=lambda i: Example(shot.read(i).frame, change(shot.read(i).target, i)))
+
+
+def test_references_are_like_their_frames_whatever_the_noise(shot):
+    found = likeness(shot)
+    assert found.correlation > 0.99
+    assert found.slope == pytest.approx(1, abs=0.02)
+    assert found.ratio == pytest.approx(1, abs=0.01)
+    assert found[3:] == ((0, 0), 0, 0)
+    assert doubts("shot", found) == ()
+
+
+def noisy_again(shot):
+    """The targets with independent noise as large as that of one sample a pixel."""
+    rng = np.random.default_rng(0)
+    return changed(shot, lambda t, _: t * rng.gamma(0.5, 2.0, (*t.shape[:2], 1)))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda t, i, ts: np.roll(t, (-3, 2), (0, 1)), "fit best moved by -2 pixels in x and 3 in y"),
+        (lambda t, i, ts: np.roll(t, 1, 1), "fit best moved by -1 pixels in x and 0 in y"),
+        (lambda t, i, ts: ts(i + 1), "fit best moved by"),
+        (lambda t, i, ts: t[::-1, ::-1], "do not look like the frames"),
+        (lambda t, i, ts: np.maximum(t, 0) ** (1 / 2.2), "to the power of 0.4"),
+        (lambda t, i, ts: np.round(255 * np.clip(t, 0, 1) ** (1 / 2.2)) / 255, "to the power of 0.4"),
+        (lambda t, i, ts: 2 * t, "2.00 times as bright"),
+    ],
+    ids=["shifted", "by one pixel", "of the next frame", "of another shot", "gamma", "8 bits", "exposure"],
+)
+def test_targets_of_something_else_are_told(shot, change, said):
+    later = shot_of_files(str(sample()), str(sample()), frames="1-5")
+    (told,) = doubts("s", likeness(changed(shot, lambda t, i: change(t, i, lambda n: later.read(n - 1).target))))
+    assert said in told
+
+
+def test_a_second_noisy_render_is_as_good_as_a_reference(shot):
+    assert doubts("s", likeness(noisy_again(shot))) == ()
+    (told,) = doubts("s", likeness(noisy_again(changed(shot, lambda t, i: np.roll(t, 3, 0)))))
+    assert "in x and -3 in y" in told
+
+
+def test_of_pictures_without_contrast_nothing_is_said():
+    """A wall and its noise: block means hold nothing by which two pictures could be alike."""
+    rng = np.random.default_rng(1)
+    like = shot_of_files(str(sample()), str(sample()), frames="0").read(0).frame
+    frame = like._replace(radiance=rng.gamma(0.5, 2.0, like.radiance.shape), emission=0 * like.emission)
+    found = likeness(Shot("wall", 1, lambda i: Example(frame, 2 + 0 * frame.emission)))
+    assert np.isnan(found.correlation)
+    assert found.displacement == (0, 0)
+    assert doubts("wall", found) == ()
+    nothing = likeness(Shot("none", 1, lambda i: Example(frame, None)))
+    assert doubts("none", nothing) == ()
+
+
+def test_pixels_that_are_not_finite_are_counted(shot):
+    def holed(index):
+        frame, target = shot.read(index)
+        radiance, target = np.array(frame.radiance), np.array(target)
+        radiance[0, 3, 4:6, 0] = np.nan
+        target[5, 7:10] = np.inf
+        return Example(frame._replace(radiance=radiance), target if index else np.full_like(target, np.nan))
+
+    height, width = shot.read(0).frame.depth.shape
+    notes = with_doubts(shot._replace(read=holed, notes=("a",))).notes
+    assert notes[0] == "a"
+    assert "10 pixels of the frames are not finite" in notes[1]
+    assert f"{12 + height * width} pixels of the targets are not finite" in notes[2]
+    assert len(notes) == 3
+
+
+IDENTITY = {
+    "files": [["a.exr", 100, 1], ["b.exr", 100, 2]],
+    "numbers": ["0.2", "4.0"],
+    "tune": ["alpha"],
+    "versions": {"jax": "0.10", "svgf_jax": "1"},
+}
+
+
+def stored(path, **header):
+    header = {"format": checkpoint.FORMAT, "identity": IDENTITY} | header
+    np.savez(path, header=np.array(json.dumps(header)), trials=np.zeros((0, 5)), values=np.zeros((0, 1)))
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ({"format": 1}, "another version of svgf-tune"),
+        (
+            {"identity": IDENTITY | {"files": [["a.exr", 100, 1], ["b.exr", 100, 3]]}},
+            r"its files was \['b.exr', 100, 3\]",
+        ),
+        ({"identity": IDENTITY | {"files": [["a.exr", 100, 1]]}}, "its files was"),
+        ({"identity": IDENTITY | {"numbers": ["0.2", "5.0"]}}, "its numbers was '5.0', now it is '4.0'"),
+        ({"identity": IDENTITY | {"tune": ["alpha", "sigma_normal"]}}, "its tune was"),
+        ({"identity": IDENTITY | {"versions": {"jax": "0.9", "svgf_jax": "1"}}}, "its versions was"),
+        ({"identity": {}}, "its files was None"),
+        ({"identity": None}, "damaged"),
+        ({"identity": [1]}, "damaged"),
+        ({"start": 0}, "damaged"),
+    ],
+    ids=str,
+)
+def test_a_checkpoint_of_another_fit_is_refused(header, said, tmp_path):
+    path = tmp_path / "c.npz"
+    stored(path, **header)
+    with pytest.raises(SvgfError, match=said):
+        checkpoint.load(path, None, IDENTITY)
+
+
+def test_a_checkpoint_that_is_something_else_is_refused(tmp_path):
+    path = tmp_path / "c.npz"
+    for content in (b"", b"PK\x03\x04", b"\x93NUMPY\x01\x00v\x00", b"{}"):
+        path.write_bytes(content)
+        with pytest.raises(SvgfError, match="damaged"):
+            checkpoint.load(path, None, IDENTITY)
+    np.savez(path, header=np.array({"format": checkpoint.FORMAT}, dtype=object))  # would be unpickled
+    with pytest.raises(SvgfError, match="damaged"):
+        checkpoint.load(path, None, IDENTITY)
