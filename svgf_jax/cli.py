@@ -18,7 +18,7 @@ from svgf_jax.commands.demo import demo
 from svgf_jax.commands.denoise import denoise
 from svgf_jax.commands.inspect import inspect
 from svgf_jax.commands.params import diff, list_, show
-from svgf_jax.commands.project import OTHERS, use_project
+from svgf_jax.commands.project import use_project
 from svgf_jax.commands.video import video
 from svgf_jax.types import SvgfError
 
@@ -65,10 +65,10 @@ def launch(
     """Run a command with the project's file behind it.
 
     Args:
-        config: Flags of this project, a table for each command; auto takes the nearest svgf-jax.toml, none ignores it.
+        config: Flags of this project, a table for each command or for all; auto takes the nearest svgf-jax.toml, none ignores it.
         max_pixels: Read pictures of up to so many pixels (268435456 if not given), however small their files.
     """
-    use_project(app, config, tables=(*(name for name in app if not name.startswith("-")), *OTHERS))
+    use_project(app, config, commands=app)
     limits.set_max_pixels(max_pixels)
     try:
         return app(tokens, exit_on_error=False, print_error=False, result_action="return_value")

@@ -8,7 +8,8 @@ from test_dry_run import run
 
 from svgf_jax import cli
 from svgf_jax.commands import denoise
-from svgf_jax.commands.project import nearest
+from svgf_jax.commands.project import _PLACES, _options, nearest
+from tune.__main__ import app as tuner
 from tune.__main__ import main as tune
 
 ROOT = Path(__file__).parents[1]
@@ -24,18 +25,17 @@ def chosen(tmp_path, monkeypatch):
         told.update(method=method, preset=preset, params=params, set=changes)
         return "", None, None
 
-    def assignments(texts, *, option, example):
-        told[option] = texts
-        if option == "--file":
-            raise KeyboardInterrupt  # before any work
+    def options(reading):
+        told["reading"] = reading
+        raise KeyboardInterrupt  # before any work
 
     monkeypatch.setattr(denoise.settings, "choose_method", choose_method)
-    monkeypatch.setattr(denoise.settings, "assignments", assignments)
+    monkeypatch.setattr(denoise.Reading, "options", options)
 
-    def run(text, *arguments):
+    def run(text, *arguments, command=("denoise", "shot", "-o", "out")):
         (tmp_path / "svgf-jax.toml").write_text(text)
         with pytest.raises(SystemExit):
-            cli.main(["denoise", "shot", "-o", "out", *arguments])
+            cli.main([*command, *arguments])
         return told
 
     return run
@@ -49,7 +49,7 @@ def test_the_file_stands_behind_the_command_line(chosen, capsys):
         "falcor",
         ("alpha=0.3", "sigma_normal=1,2", "taa=true"),
     )
-    assert told["--channel"] == ("albedo=a,b,c",)
+    assert told["reading"].channel == ("albedo=a,b,c",)
     assert "svgf-jax.toml: preset, set, png, channel" in capsys.readouterr().err
     told = chosen(text, "--preset", "paper", "--set", "alpha=0.9")
     assert (told["preset"], told["set"]) == ("paper", ("alpha=0.9",))
@@ -82,10 +82,19 @@ def test_the_nearest_file_above_is_taken(tmp_path):
     [
         ("[denoise]\n\npgn = true", "svgf-jax.toml:3: denoise has no option 'pgn'. Did you mean png? There are cam"),
         ("[denoise]\npng = 1", "svgf-jax.toml:2: png = 1; wanted true or false"),
-        ("[denoise]\npreset = true", "svgf-jax.toml:2: preset = true; wanted one text or number"),
-        ("[denoise]\npreset = ['a', 'b']", "svgf-jax.toml:2: preset = a,b; wanted one text or number"),
-        ("[denoise]\nset = false", "svgf-jax.toml:2: set = false; wanted a list or a table"),
-        ("[denoise]\nfps = 'fast'", "svgf-jax.toml:2: unable to convert"),
+        ("[denoise]\npreset = true", "svgf-jax.toml:2: preset = true; wanted a text."),
+        ("[denoise]\npreset = ['a', 'b']", "svgf-jax.toml:2: preset = a,b; wanted a text"),
+        ("[denoise]\nset = false", "svgf-jax.toml:2: set = false; wanted a list of texts, or a table"),
+        ("[denoise]\nfps = 'fast'", "svgf-jax.toml:2: fps = fast; wanted a number."),
+        ("[denoise]\nframes = 5", 'svgf-jax.toml:2: frames = 5; wanted a text: frames = "5".'),
+        ("[denoise]\ndevices = 1.5", "svgf-jax.toml:2: devices = 1.5; wanted a whole number."),
+        ("[denoise]\nchannel = [1]", "svgf-jax.toml:2: channel = 1; wanted a list of texts, or a table."),
+        ("[denoise]\nset = { alpha = { x = 1 } }", "svgf-jax.toml:2: set = "),
+        (
+            "[all]\nrendrer = 'a'",
+            "svgf-jax.toml:2: no command has an option 'rendrer'. Did you mean renderer? There are",
+        ),
+        ("[all]\nlayer = 3", "svgf-jax.toml:2: layer = 3; wanted a text"),
         ("[denoise]\nmissing = 'skip'", 'svgf-jax.toml:2. Choose from: "error"'),
         ("[denois]\n", "svgf-jax.toml:1: got 'denois'"),
         ("png = true", "svgf-jax.toml:1: got 'png'; wanted a table for each command"),
@@ -95,6 +104,47 @@ def test_the_nearest_file_above_is_taken(tmp_path):
 def test_what_is_wrong_is_named_with_its_line(text, complaint, chosen, capsys):
     chosen(text)
     assert complaint in capsys.readouterr().err
+
+
+def test_a_table_for_all_stands_behind_those_of_the_commands(chosen, tmp_path, capsys):
+    text = "[all]\nrenderer = 'cycles'\nlayer = 'a'\npreset = 'tuned'\nflip = true\n[denoise]\nlayer = 'b'\nparams = 'p.toml'\n"
+    told = chosen(text, "--motion", "y-up")
+    assert (told["preset"], str(told["params"])) == (None, "p.toml")
+    assert (told["reading"].renderer, told["reading"].layer, told["reading"].motion) == ("cycles", "b", "y-up")
+    assert "svgf-jax.toml: layer, params, renderer\n" in capsys.readouterr().err
+    assert chosen(text, command=("inspect", "shot"))["reading"].layer == "a"
+    assert chosen(text, "--layer", "c")["reading"].layer == "c"
+    (tmp_path / "svgf-jax.toml").write_text(text)
+    with pytest.raises(SystemExit):
+        tune(["noisy", "--reference", "refs", "-o", "p.toml", "--max-steps", "1"])
+    assert told["reading"].layer == "a"
+
+
+def test_relative_paths_count_from_the_files_folder(chosen, tmp_path, monkeypatch):
+    text = (
+        "[denoise]\nparams = 'p.toml'\ncameras = 'c.json'\nrenderer = 'r.toml'\n"
+        "file = { normal = 'n/a_#.exr', albedo = 'b_#.exr' }"
+    )
+    told = chosen(text)
+    assert (str(told["params"]), told["reading"].cameras) == ("p.toml", "c.json")  # as it stands there
+    (tmp_path / "deep").mkdir()
+    monkeypatch.chdir(tmp_path / "deep")
+    for more in ((), ("--config", "../svgf-jax.toml")):
+        told = chosen(text, *more)
+        reading = told["reading"]
+        found = (told["params"], reading.cameras, reading.renderer, reading.file[0].removeprefix("normal="))
+        assert [Path(one).resolve() for one in found] == [
+            tmp_path / one for one in ("p.toml", "c.json", "r.toml", "n/a_#.exr")
+        ]
+        assert reading.file[1] == "albedo=b_#.exr"  # beside the frames
+    told = chosen("[denoise]\ncameras = 'none'\nrenderer = 'cycles'")["reading"]
+    assert (told.cameras, told.renderer) == ("none", "cycles")
+
+
+def test_every_option_that_names_files_is_there():
+    commands = [cli.app[name] for name in ("denoise", "compare", "inspect", "ablate")]
+    known = {name for app in (*commands, tuner) for name in _options(app.assemble_argument_collection())}
+    assert known >= set(_PLACES)
 
 
 def test_a_file_that_was_asked_for_must_be_there(chosen, capsys):

@@ -7,6 +7,7 @@ from typing import Annotated, Any, NoReturn
 from cyclopts import App, CycloptsError, Group, Parameter
 
 from svgf_jax import SvgfError, __version__
+from svgf_jax.cli import app as svgf_jax
 from svgf_jax.commands.project import use_project
 from tune.command import command
 
@@ -28,9 +29,9 @@ def launch(
     """Run with the project's file behind the command line.
 
     Args:
-        config: Flags of this project, its table [tune]; auto takes the nearest svgf-jax.toml, none ignores it.
+        config: Flags of this project, its tables [tune] and [all]; auto takes the nearest svgf-jax.toml, none ignores it.
     """
-    use_project(app, config, table="tune")
+    use_project(app, config, commands=svgf_jax, table="tune")
     try:
         return app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
     finally:

@@ -1,5 +1,6 @@
 """`svgf-tune`: options in, a parameter file out. Nothing here imports JAX or NumPy at the top: help and errors answer at once."""
 
+import dataclasses
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,16 +11,16 @@ from cyclopts import Group, Parameter
 
 from svgf_jax import SvgfError
 from svgf_jax.commands import settings, terminal
+from svgf_jax.commands.settings import INPUT, Flag, Reading
 
 if TYPE_CHECKING:
     from tune.fitting import Fit
     from tune.shots import Shot
 
-Flag = Parameter(negative=(), show_default=False)
 Repeated = Parameter(negative=(), consume_multiple=True, show_default=False)
 SECOND = ("alt", "second", "noisy2")  # what the second render is called in a folder
 MAPS = "sensitivity.exr"  # as `explore.write_maps` calls it
-INPUT, WHAT, HOW, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["Input", "What", "How", "Output"]))
+WHAT, HOW, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["What", "How", "Output"], 1))
 
 
 def command(
@@ -33,12 +34,7 @@ def command(
     validate_reference: Annotated[tuple[str, ...], Repeated, Parameter(metavar="REF", group=INPUT)] = (),
     frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
     validate_frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
-    channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = (),
-    file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = (),
-    cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto",
-    renderer: Annotated[str, Parameter(metavar="NAME", group=INPUT)] = "auto",
-    layer: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None,
-    motion: Annotated[str | None, Parameter(metavar="WORDS", group=INPUT)] = None,
+    reading: Reading = Reading(),
     preset: Annotated[str | None, Parameter(metavar="NAME", group=WHAT)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=WHAT)] = None,
     set_: Annotated[
@@ -77,12 +73,6 @@ def command(
         validate_reference: Their references, in the same order.
         frames: Only these frames of the sequences to tune on: 1-100, 1-100x2 or 1,3,5-9.
         validate_frames: Only these frames of the sequences to validate on.
-        channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
-        file: The files of a role, for example normal=normal_####.exr. Repeatable.
-        cameras: The cameras.json of a sequence; auto takes the one beside the frames, none ignores it.
-        renderer: Whose names and conventions: native, mitsuba, cycles, falcor, pbrt, ..., or a table of your own (mine.toml).
-        layer: The view layer, where a file has several.
-        motion: What motion vectors mean: pixel|fraction|ndc|world, y-down|y-up, to-previous|from-previous|to-next|from-next.
         preset: The preset to start from; paper if neither it nor --params is given.
         params: The parameter file to start from.
         set_: One parameter of the start: sigma_normal=64. Repeatable.
@@ -124,9 +114,7 @@ def command(
         raise SvgfError(f"{checkpoint}: no checkpoint to resume from; start without --resume.")
     if maps is not None and maps.exists() and not maps.is_dir():
         raise SvgfError(f"--maps {maps} is a file; wanted a folder.")
-    reading = settings.source_options(
-        channel=channel, file=file, cameras=cameras, renderer=renderer, layer=layer, motion=motion
-    )
+    opened = reading.options()
     if flip:
         from svgf_jax.metrics import require_flip
 
@@ -141,13 +129,10 @@ def command(
     from tune.targets import with_doubts
     from tune.telling import conclude, live, versions
 
-    references = [shot_of_files(n, r, frames=frames, **reading) for n, r in zip(noisy, reference, strict=False)]
-    seconds = [
-        shot_of_files(n, s, frames=frames, prefer=SECOND, **reading) for n, s in zip(noisy, second, strict=False)
-    ]
+    references = [shot_of_files(n, r, frames=frames, **opened) for n, r in zip(noisy, reference, strict=False)]
+    seconds = [shot_of_files(n, s, frames=frames, prefer=SECOND, **opened) for n, s in zip(noisy, second, strict=False)]
     held = [
-        shot_of_files(n, r, frames=validate_frames, **reading)
-        for n, r in zip(validate, validate_reference, strict=True)
+        shot_of_files(n, r, frames=validate_frames, **opened) for n, r in zip(validate, validate_reference, strict=True)
     ]
     references, seconds, held = (list(map(with_doubts, group)) for group in (references, seconds, held))
     shots: list[Shot] = seconds or references
@@ -173,7 +158,7 @@ def command(
         "seed": seed,
         "starts": starts,
         "choices": [str(choice) for choice in config],
-        "reading": [channel, file, cameras, renderer, layer, motion],
+        "reading": list(dataclasses.astuple(reading)),
         "files": [stamp(path) for shot in shots for path in shot.paths],
         "versions": versions(),
     }

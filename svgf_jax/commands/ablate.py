@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Group, Parameter
 
 from svgf_jax.commands import results, settings, terminal
+from svgf_jax.commands.settings import INPUT, Flag, Reading, Repeated
 from svgf_jax.types import SvgfError
 
 if TYPE_CHECKING:
     from svgf_jax.ablation import Measured
 
-Flag = Parameter(negative=(), show_default=False)
-Repeated = Parameter(negative=(), consume_multiple=False, show_default=False)
-INPUT, BASE, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["Input", "Base and rows", "Output"]))
+BASE, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["Base and rows", "Output"], 1))
 COLUMNS = {
     "psnr": ("PSNR dB", "{:.2f}"),
     "relmse": ("relMSE", "{:.3g}"),
@@ -32,12 +31,7 @@ def ablate(
     *,
     reference: Annotated[str, Parameter(metavar="REF", group=INPUT)],
     frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
-    channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = (),
-    file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = (),
-    cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto",
-    renderer: Annotated[str, Parameter(metavar="NAME", group=INPUT)] = "auto",
-    layer: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None,
-    motion: Annotated[str | None, Parameter(metavar="WORDS", group=INPUT)] = None,
+    reading: Reading = Reading(),
     preset: Annotated[str | None, Parameter(metavar="NAME", group=BASE)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=BASE)] = None,
     set_: Annotated[tuple[str, ...], Repeated, Parameter(name="--set", metavar="NAME=VALUE", group=BASE)] = (),
@@ -59,12 +53,6 @@ def ablate(
         input_: The noisy sequence: a folder, a pattern or a file.
         reference: Its references; frames are paired by number.
         frames: Only these: 1-100, 1-100x2 or 1,3,5-9.
-        channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
-        file: The files of a role, for example normal=normal_####.exr. Repeatable.
-        cameras: The cameras.json of the sequence, or matrix_#.mat; auto takes the one beside the frames, none ignores it.
-        renderer: Whose names and conventions: native, mitsuba, cycles, falcor, pbrt, ..., or a table of your own (mine.toml).
-        layer: The view layer, where a file has several.
-        motion: What motion vectors mean: pixel|fraction|ndc|world, y-down|y-up, to-previous|from-previous|to-next|from-next.
         preset: The base: a preset by name; `svgf-jax params list` shows them.
         params: The base: parameters from a TOML file.
         set_: One parameter of the base, or one value per a-trous level. Repeatable.
@@ -78,9 +66,7 @@ def ablate(
         overwrite: Replace the files of --json, --csv, --markdown and --report if they exist.
     """
     record, chosen, config = settings.choose(preset, params, set_)
-    reading = settings.source_options(
-        channel=channel, file=file, cameras=cameras, renderer=renderer, layer=layer, motion=motion
-    )
+    opened = reading.options()
     results.require_writable((json_file, csv_file, markdown_file, report), overwrite=overwrite)
 
     from svgf_jax import ablation
@@ -89,7 +75,7 @@ def ablate(
     from svgf_jax.references import pair_references
     from svgf_jax.report import ablation_page, watch_rows
 
-    source = open_source(input_, frames=frames, **reading)
+    source = open_source(input_, frames=frames, **opened)
     references, lacking = pair_references(source.sequence, reference)
     if themselves := {path for _, path in source.sequence.files} & set(references.values()):
         raise SvgfError(f"Got {min(map(str, themselves))} as its own reference; wanted a converged render of it.")

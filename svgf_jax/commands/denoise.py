@@ -12,13 +12,12 @@ from cyclopts import Group, Parameter
 
 from svgf_jax.commands import results, settings, terminal
 from svgf_jax.commands.rehearsal import describe_input, rehearse
+from svgf_jax.commands.settings import INPUT, Flag, Reading, Repeated
 from svgf_jax.types import SvgfError
 
 if TYPE_CHECKING:
     from svgf_jax.streaming import Summary
 
-Flag = Parameter(negative=(), show_default=False)
-Repeated = Parameter(negative=(), consume_multiple=False, show_default=False)
 Method = Literal[
     "svgf",
     "games202",
@@ -31,7 +30,7 @@ Method = Literal[
 ]
 Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab"]
 HEADERS = 200  # of frames that are looked at before a run starts: a fifth of a second
-INPUT, FILTER, OUTPUT, RUN = (Group(name, sort_key=i) for i, name in enumerate(["Input", "Filter", "Output", "Run"]))
+FILTER, OUTPUT, RUN = (Group(name, sort_key=i) for i, name in enumerate(["Filter", "Output", "Run"], 1))
 
 
 def denoise(
@@ -42,12 +41,7 @@ def denoise(
     frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
     missing: Annotated[Literal["error", "hold", "reset"], Parameter(group=INPUT)] = "error",
     warmup: Annotated[int | None, Parameter(metavar="FRAMES", group=INPUT)] = None,
-    channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = (),
-    file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = (),
-    cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto",
-    renderer: Annotated[str, Parameter(metavar="NAME", group=INPUT)] = "auto",
-    layer: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None,
-    motion: Annotated[str | None, Parameter(metavar="WORDS", group=INPUT)] = None,
+    reading: Reading = Reading(),
     method: Annotated[Method, Parameter(group=FILTER)] = "svgf",
     preset: Annotated[str | None, Parameter(metavar="NAME", group=FILTER)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=FILTER)] = None,
@@ -84,12 +78,6 @@ def denoise(
         missing: A missing frame is an error, repeats the output before it (hold), or starts the history anew (reset).
         warmup: Filter so many frames before --frames too, to fill the history, and don't write them: the task of a render
             farm. Such parts of a sequence may be written into one folder at a time.
-        channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
-        file: The files of a role, for example normal=normal_####.exr. Repeatable.
-        cameras: The cameras.json of the sequence, or matrix_#.mat; auto takes the one beside the frames, none ignores it.
-        renderer: Whose names and conventions: native, mitsuba, cycles, falcor, pbrt, ..., or a table of your own (mine.toml).
-        layer: The view layer, where a file has several.
-        motion: What motion vectors mean: pixel|fraction|ndc|world, y-down|y-up, to-previous|from-previous|to-next|from-next.
         method: games202: joint bilateral, then project and accumulate; the others are parts, -atrous in a-trous passes.
         preset: A preset of svgf by name; `svgf-jax params list` shows them.
         params: Parameters from a TOML file; `svgf-jax params show` prints one.
@@ -119,9 +107,7 @@ def denoise(
     """
     changes = (*set_, "taa=true") if taa else set_
     chosen_preset, chosen, config = settings.choose_method(method, preset, params, changes)
-    reading = settings.source_options(
-        channel=channel, file=file, cameras=cameras, renderer=renderer, layer=layer, motion=motion
-    )
+    opened = reading.options()
     if reference is not None and report is None:
         raise SvgfError(f"Got --reference {reference} without --report; references are for the report.")
     results.require_writable((report,), overwrite=overwrite or resume)
@@ -140,7 +126,7 @@ def denoise(
         frames=frames,
         missing=missing,
         warmup=warmup,
-        **reading,
+        **opened,
         position=getattr(config, "filter", "") == "joint-bilateral",
     )
     scan = scan_files(source, most=None if dry_run else HEADERS)

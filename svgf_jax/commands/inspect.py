@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Group, Parameter
 
 from svgf_jax.commands import settings, terminal
+from svgf_jax.commands.settings import INPUT, Flag, Reading
 
 if TYPE_CHECKING:
     from svgf_jax.findings import Finding
     from svgf_jax.geometry import Fit
     from svgf_jax.inspection import Facts
 
-Flag = Parameter(negative=(), show_default=False)
-Repeated = Parameter(negative=(), consume_multiple=False, show_default=False)
-INPUT, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["Input", "Output"]))
+OUTPUT = Group("Output", sort_key=1)
 CONVENTIONS = 4  # motion conventions that are shown besides those that fit
 Rows = list[tuple[str, str]]
 
@@ -25,12 +24,7 @@ def inspect(
     *,
     frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
     missing: Annotated[Literal["error", "hold", "reset"], Parameter(group=INPUT)] = "error",
-    channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = (),
-    file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = (),
-    cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto",
-    renderer: Annotated[str, Parameter(metavar="NAME", group=INPUT)] = "auto",
-    layer: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None,
-    motion: Annotated[str | None, Parameter(metavar="WORDS", group=INPUT)] = None,
+    reading: Reading = Reading(),
     preset: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None,
     json: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
     strict: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
@@ -43,26 +37,18 @@ def inspect(
         input_: A folder, a pattern (frame_####.exr, frame_%04d.exr, frame_$F4.exr) or one file.
         frames: Only these: 1-100, 1-100x2 or 1,3,5-9.
         missing: As for denoise: hold and reset allow missing frames.
-        channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
-        file: The files of a role, for example normal=normal_####.exr. Repeatable.
-        cameras: The cameras.json of the sequence, or matrix_#.mat; auto takes the one beside the frames, none ignores it.
-        renderer: Whose names and conventions: native, mitsuba, cycles, falcor, pbrt, ..., or a table of your own (mine.toml).
-        layer: The view layer, where a file has several.
-        motion: What motion vectors mean: pixel|fraction|ndc|world, y-down|y-up, to-previous|from-previous|to-next|from-next.
         preset: The preset of the run, for its history and time; `svgf-jax params list` shows them.
         json: Print everything as JSON to the standard output instead.
         strict: Exit with 2 if there is anything to mend, too.
     """
     _, params, config = settings.choose(preset, None, ())
-    reading = settings.source_options(
-        channel=channel, file=file, cameras=cameras, renderer=renderer, layer=layer, motion=motion
-    )
+    opened = reading.options()
 
     from svgf_jax.findings import judge, verdict
     from svgf_jax.frames import open_source
     from svgf_jax.inspection import inspect_source
 
-    source = open_source(input_, frames=frames, missing="reset" if missing == "error" else missing, **reading)
+    source = open_source(input_, frames=frames, missing="reset" if missing == "error" else missing, **opened)
     facts = inspect_source(source, params=params, config=config)
     findings = judge(facts, gaps_allowed=missing != "error")
     if json:

@@ -1,8 +1,11 @@
 """Options that set numbers and names: `--preset`, `--params`, `--set NAME=VALUE`, `--channel ROLE=...`. No JAX."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from cyclopts import Group, Parameter
 
 from svgf_jax.methods import METHOD_CHOICES, MethodConfig, check_settable, override_method
 from svgf_jax.types import CHOICES, Config, Params, SvgfError, choices_of
@@ -42,26 +45,45 @@ def choose_method(
     return " ".join([method, *(f"{key}={text}" for key, text in texts.items())]), *override_method(method, values)
 
 
-def source_options(
-    *,
-    channel: Iterable[str],
-    file: Iterable[str],
-    cameras: str,
-    renderer: str,
-    layer: str | None,
-    motion: str | None,
-) -> dict[str, Any]:
-    """What the options of the input mean to `open_source`."""
-    roles = assignments(channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
-    files = assignments(file, option="--file", example="normal=normal_####.exr")
-    return {
-        "channel": {role: names.split(",") for role, names in roles.items()},
-        "file": files,
-        "cameras": None if cameras == "none" else cameras,
-        "renderer": renderer,
-        "layer": layer,
-        "motion": motion,
-    }
+INPUT = Group("Input", sort_key=0)
+Flag = Parameter(negative=(), show_default=False)
+Repeated = Parameter(negative=(), consume_multiple=False, show_default=False)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """The options that say what the input's channels and files mean: one group for every command that reads a sequence.
+
+    (Not a NamedTuple: of its fields cyclopts sees no annotations.)
+
+    Attributes:
+        channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
+        file: The files of a role, for example normal=normal_####.exr. Repeatable.
+        cameras: The cameras.json of the sequence, or matrix_#.mat; auto takes the one beside the frames, none ignores it.
+        renderer: Whose names and conventions: native, mitsuba, cycles, falcor, pbrt, ..., or a table of your own (mine.toml).
+        layer: The view layer, where a file has several.
+        motion: What motion vectors mean: pixel|fraction|ndc|world, y-down|y-up, to-previous|from-previous|to-next|from-next.
+    """
+
+    channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = ()
+    file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = ()
+    cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto"
+    renderer: Annotated[str, Parameter(metavar="NAME", group=INPUT)] = "auto"
+    layer: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None
+    motion: Annotated[str | None, Parameter(metavar="WORDS", group=INPUT)] = None
+
+    def options(self) -> dict[str, Any]:
+        """What they mean to `open_source`."""
+        roles = assignments(self.channel, option="--channel", example="albedo=foo.R,foo.G,foo.B")
+        return {
+            "channel": {role: names.split(",") for role, names in roles.items()},
+            "file": assignments(self.file, option="--file", example="normal=normal_####.exr"),
+            "cameras": None if self.cameras == "none" else self.cameras,
+            "renderer": self.renderer,
+            "layer": self.layer,
+            "motion": self.motion,
+        }
 
 
 def assignments(texts: Iterable[str], *, option: str, example: str) -> dict[str, str]:
