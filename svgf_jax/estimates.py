@@ -8,6 +8,9 @@ from svgf_jax.scan import Scan
 # Mitsuba frames tiled to 960 x 540 and 1920 x 1080, one and two signals, preset `paper`, two cores of a server CPU with AVX-512.
 SECONDS = 3.4e-7  # a pixel: reading 22 channels, writing, what is done once for all signals
 SECONDS_A_LEVEL = 4.3e-8  # a pixel, signal and a-trous level; all before the first level counts for two
+SECONDS_OF_LIGHT = (
+    1.1e-7  # a pixel and signal, where changes of the light are followed: by tests/bench/README.md, 1920 x 1080
+)
 BASE_MEMORY = 4.5e8  # bytes: Python, JAX, compilation
 MEMORY = 910.0  # bytes a pixel
 MEMORY_A_SIGNAL = 310.0
@@ -30,7 +33,8 @@ class Estimate(NamedTuple):
 def estimate(scan: Scan, *, pixels: int, signals: int, config: Any, options: WriteOptions = WriteOptions()) -> Estimate:
     """Estimate a run over frames of so many `pixels` and `signals`; `config` is that of the filter."""
     levels = getattr(config, "levels", None) or 5  # other methods leave it open
-    seconds = pixels * (SECONDS + SECONDS_A_LEVEL * signals * (levels + 2))
+    light = SECONDS_OF_LIGHT if getattr(config, "light_cell", 0) else 0.0
+    seconds = pixels * (SECONDS + signals * (SECONDS_A_LEVEL * (levels + 2) + light))
     memory = BASE_MEMORY + pixels * (MEMORY + MEMORY_A_SIGNAL * signals)
     return Estimate(seconds, memory, _disk(scan, pixels, signals, options))
 

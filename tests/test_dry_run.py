@@ -38,7 +38,7 @@ def test_a_dry_run_tells_everything_and_writes_nothing(shot, tmp_path, capsys):
     assert f"3 frames (1-3), {SIZE[1]} x {SIZE[0]}" in error
     assert "albedo    albedo.RGB (native name)" in error
     assert "would filter 3 frames and write 6 files" in error
-    assert re.search(r"about \d+ s on two cores .* of memory, at most .* of disk", error)
+    assert re.search(r"about \d+ s on two cores after compiling .* of memory, at most .* of disk", error)
     assert "nothing was written" in error
     told = json.loads(out)
     assert [name.rsplit("/", 1)[1] for name in told["files"][:2]] == ["shot.0001.exr", "shot.0001.png"]
@@ -50,12 +50,18 @@ def test_a_dry_run_tells_everything_and_writes_nothing(shot, tmp_path, capsys):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_dry_run_knows_every_method(shot, tmp_path, capsys, method):
     scan = scan_files(open_source(shot))
-    config = Config() if method == "svgf" else override_method(method, {})[1]
+    config = override_method(method, {})[1]
     assert 0 < estimate(scan, pixels=1000, signals=2, config=config).seconds < 1
     if method == "accumulate":
         code, _, error = run(capsys, "denoise", shot, "-o", tmp_path / "out", "--dry-run", "--method", method)
         assert code == 0, error
         assert "nothing was written" in error
+
+
+def test_following_the_light_takes_longer(shot):
+    scan = scan_files(open_source(shot))
+    plain, light = (estimate(scan, pixels=1000, signals=2, config=Config(light_cell=cell)).seconds for cell in (0, 4))
+    assert 1.1 < light / plain < 1.3
 
 
 @pytest.mark.parametrize(
@@ -66,6 +72,7 @@ def test_a_dry_run_knows_every_method(shot, tmp_path, capsys, method):
         (["-o", "done"], "exists already"),
         (["-o", "out", "--fps", "0"], "from 0.1 to 1000"),
         (["-o", "out", "--resume", "--overwrite"], "Choose one"),
+        (["-o", "out", "--tev-address", "localhost"], "wanted HOST:PORT"),
     ],
 )
 def test_a_dry_run_finds_what_the_run_would(shot, tmp_path, capsys, monkeypatch, arguments, hint):

@@ -14,6 +14,7 @@ import threading
 import numpy as np
 import pytest
 from shots import init, step, write_shot
+from test_dry_run import run as run_command
 
 from svgf_jax import exr, streaming
 from svgf_jax.frames import open_source, read_frame
@@ -102,6 +103,22 @@ def test_every_frame_arrives_with_its_layers(tmp_path):
         assert (planes["history_length"] == number).all()
         assert (planes["valid"] == (number > 1)).all()
         assert np.isfinite(planes["variance"]).all()
+
+
+def test_a_dry_run_finds_the_viewer_or_says_that_there_is_none(tmp_path, capsys):
+    pytest.importorskip("tevclient")
+    shot, viewer = write_shot(tmp_path / "in", [1, 2]), Viewer()
+    code, _, error = run_command(
+        capsys, "denoise", shot, "-o", tmp_path / "out", "--dry-run", "--tev-address", viewer.address
+    )
+    viewer.close()
+    assert (code, viewer.images) == (0, {})
+    assert f"tev listens at {viewer.address}" in error
+    code, _, error = run_command(
+        capsys, "denoise", shot, "-o", tmp_path / "out", "--dry-run", "--tev-address", viewer.address
+    )
+    assert code == 2
+    assert f"No tev at {viewer.address}" in error
 
 
 def test_a_viewer_that_goes_away_does_not_end_the_run(tmp_path):

@@ -146,15 +146,19 @@ def denoise(
         shown = reports.Run(source, out, method, chosen_preset, chosen, config, options, references, {})
     task: dict[str, Any] = {"params": chosen, "config": config, "method": method, "preset": chosen_preset}
     task |= {"options": options, "video": video, "fps": fps}
-    if dry_run:
-        plan, _ = streaming.prepare(source, out, **task)
-        told = rehearse(source, scan, plan, config=config, options=options, resume=resume, overwrite=overwrite)
-        if json:
-            terminal.print_json(told | {"method": method, "preset": chosen_preset} | numbers(chosen, config))
-        return 0
     viewer = nullcontext()
     if tev or tev_address is not None:
         viewer = send_to_tev(tev_address or ADDRESS, tell=lambda text: terminal.warn([text]))
+    if dry_run:
+        with viewer as reached:
+            pass
+        plan, _ = streaming.prepare(source, out, **task)
+        told = rehearse(source, scan, plan, config=config, options=options, resume=resume, overwrite=overwrite)
+        if reached is not None:
+            terminal.tell(f"tev listens at {tev_address or ADDRESS}")
+        if json:
+            terminal.print_json(told | {"method": method, "preset": chosen_preset} | numbers(chosen, config))
+        return 0
     watch = None if shown is None else reports.watch(shown)
     with (
         viewer as send,

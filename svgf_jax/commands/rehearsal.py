@@ -68,7 +68,7 @@ def rehearse(
         terminal.tell(f"first: {files[0]}")
         terminal.tell(f"last:  {files[-1]}")
     terminal.tell(
-        f"about {terminal.duration(needs.seconds * todo)} on two cores ({needs.seconds:.2g} s a frame), "
+        f"about {terminal.duration(needs.seconds * todo)} on two cores after compiling ({needs.seconds:.2g} s a frame), "
         f"{terminal.size(memory)} of memory, at most {terminal.size(disk)} of disk"
     )
     if available and memory > available:
