@@ -10,6 +10,7 @@ Several parts of one sequence may be written into one folder at a time: each has
 """
 
 import contextlib
+import errno
 import json
 import os
 import socket
@@ -17,7 +18,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TextIO
 
 import numpy as np
 
@@ -45,38 +46,76 @@ def state_folder(out: Path, part: str = "") -> Path:
 
 
 @contextmanager
-def lock(state: Path) -> Iterator[None]:
+def lock(state: Path) -> Iterator[Callable[[], None]]:
     """Hold a state folder, creating it, so that no second run writes there; `SvgfError` if one does.
 
     Parts keep a run of the whole out, and it them, but not each other. The lock dies with its process, however that ends.
-    Where the file system has no locks, it is silently no protection.
+    Where the file system has no locks, it is silently no protection. Gives a function that raises `SvgfError` once the
+    folder was removed: another run may have it since.
     """
-    with _held(state.parent, shared=True) if state.name != FOLDER else contextlib.nullcontext(), _held(state):
-        yield
+    with _held(state.parent, shared=True) if state.name != FOLDER else contextlib.nullcontext(), _held(state) as still:
+        yield still
 
 
 @contextmanager
-def _held(state: Path, *, shared: bool = False) -> Iterator[None]:
+def _held(state: Path, *, shared: bool = False) -> Iterator[Callable[[], None]]:
+    path = state / "lock"
     try:
-        state.mkdir(parents=True, exist_ok=True)
-        file = open(state / "lock", "a+")  # noqa: SIM115 (closed below; open for as long as the lock is held)
+        file = _locked(path, shared=shared)
     except OSError as error:
-        raise SvgfError(
-            f"Cannot write into the output folder {_folder(state)}: {error.strerror or error}. "
-            "Wanted a folder that is writable or can be created; try another one."
-        ) from error
+        raise unwritable(_folder(state), error) from error
     with file:
-        if not _try_lock(file, shared=shared):
-            file.seek(0)
-            raise SvgfError(
-                f"Another run is writing into {_folder(state)} ({file.read().strip() or 'parts of the sequence'}). "
-                "Wait for it to end, or choose another output folder."
-            )
-        file.truncate(0)
+        known = _is(file, path)
+
+        def still() -> None:
+            if known and not _is(file, path):
+                raise SvgfError(
+                    f"{path} is gone: the output folder was removed while this run wrote into it, and another run may be "
+                    "writing there now. Start this one again, with --resume or into another folder."
+                )
+
         if not shared:
+            file.truncate(0)
             file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
             file.flush()
-        yield
+        yield still
+
+
+def _locked(path: Path, *, shared: bool) -> TextIO:
+    """The lock file, open and locked, its folder made. A run that failed may remove it in between: then again."""
+    for _ in range(10):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = open(path, "a+")  # noqa: SIM115 (open for as long as the lock is held)
+        if not _try_lock(file, shared=shared):
+            with file:
+                file.seek(0)
+                holder = file.read().strip() or "parts of the sequence"
+            raise SvgfError(
+                f"Another run is writing into {_folder(path.parent)} ({holder}). "
+                "Wait for it to end, or choose another output folder."
+            )
+        if _is(file, path):
+            return file
+        file.close()
+    raise OSError(errno.ESTALE, f"{path} does not stay what it is")
+
+
+def _is(file: TextIO, path: Path) -> bool:
+    """Whether an open file is still the one of that name."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
+    except FileNotFoundError:
+        return False
+    except OSError:  # not to be told; what comes next says more
+        return True
+
+
+def unwritable(folder: str | Path, error: OSError) -> SvgfError:
+    """What is said where an output folder cannot be written into."""
+    return SvgfError(
+        f"Cannot write into the output folder {folder}: {error.strerror or error}. "
+        "Wanted a folder that is writable or can be created; try another one."
+    )
 
 
 def _folder(state: Path) -> str:
@@ -172,10 +211,12 @@ def append_figures(state: Path, figures: Mapping[str, Any]) -> None:
     """Note what is known of one frame that is done; its "number" says which. Raises SvgfError."""
     path = state / "frames.jsonl"
     try:
-        with path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(dict(figures), default=str) + "\n")
+        with path.open("ab+") as file:
+            file.seek(max(file.tell() - 1, 0))
+            cut_off = file.read() not in (b"", b"\n")  # by a full disk, or with its process
+            file.write(b"\n" * cut_off + json.dumps(dict(figures), default=str).encode() + b"\n")
     except OSError as error:
-        raise SvgfError(f"Could not write {path}: {error}. Check that the disk is not full.") from error
+        raise _not_written(path, error) from error
 
 
 def load_figures(state: Path) -> dict[int, dict[str, Any]]:
@@ -197,6 +238,14 @@ def remove_figures(state: Path) -> None:
 def remove_checkpoint(state: Path) -> None:
     """Forget the history; the record in run.json stays."""
     (state / "checkpoint.npz").unlink(missing_ok=True)
+
+
+def remove_state(state: Path) -> None:
+    """Remove the state folder of a run that came to nothing. Only for who holds its lock, which goes last."""
+    with contextlib.suppress(OSError):
+        for path in sorted(state.iterdir(), key=lambda path: path.name == "lock"):
+            path.unlink()
+        state.rmdir()
 
 
 def _differences(saved: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
@@ -222,7 +271,13 @@ def _replace(path: Path, write: Callable[[BinaryIO], Any]) -> None:
         with atomic.replacing(path, unique=False) as temporary, temporary.open("wb") as file:
             write(file)
     except OSError as error:
-        raise SvgfError(f"Could not write {path}: {error}. Check that the disk is not full.") from error
+        raise _not_written(path, error) from error
+
+
+def _not_written(path: Path, error: OSError) -> SvgfError:
+    return SvgfError(
+        f"Could not write {path}: {error.strerror or error}. Is the disk full, or the folder gone or read-only?"
+    )
 
 
 def _try_lock(file: Any, *, shared: bool) -> bool:

@@ -27,6 +27,7 @@ class Plan(NamedTuple):
         hold: whether the history is kept across a missing frame.
         warmup: how many of the first frames are filtered for the sake of the history only.
         state: where the run's state is kept (see `svgf_jax.checkpoint`).
+        others: further files of the same frames.
     """
 
     out: Path
@@ -38,6 +39,7 @@ class Plan(NamedTuple):
     hold: bool
     warmup: int
     state: Path
+    others: tuple[Files, ...] = ()
 
 
 def make_plan(
@@ -76,9 +78,10 @@ def make_plan(
             raise SvgfError(f"The output {path} would replace an input. Choose another output folder.")
     stem = _stem(next((path.name for path in planned if path), ""))
     film = out / f"{stem}{f'.{part}' if part else ''}.mp4" if video else None
-    stamps = [[files[i][0], *(stamp(sequence[i][1]) for sequence in (files, *others))] for i in range(len(files))]
     state = checkpoint.state_folder(out, part)
-    return Plan(out, files, planned, png, film, identity | {"frames": stamps}, hold, before, state)
+    plan = Plan(out, files, planned, png, film, dict(identity), hold, before, state, tuple(others))
+    plan.identity["frames"] = [stamp_frame(plan, index) for index in range(len(files))]
+    return plan
 
 
 def output_paths(files: Files, out: Path, *, hold: bool, warmup: int = 0) -> tuple[Path | None, ...]:
@@ -99,12 +102,24 @@ def begin(plan: Plan, *, resume: bool, overwrite: bool) -> Checkpoint | None:
     """
     start = find_start(plan, resume=resume, overwrite=overwrite)
     if start is not None:
-        if start.next_index == 0:
-            checkpoint.remove_checkpoint(plan.state)
-            checkpoint.remove_figures(plan.state)
-        _remove_temporary(plan)
+        try:
+            if start.next_index == 0:
+                checkpoint.remove_checkpoint(plan.state)
+                checkpoint.remove_figures(plan.state)
+            _remove_temporary(plan)
+        except OSError as error:
+            raise checkpoint.unwritable(plan.out, error) from error
         checkpoint.save_run(plan.state, plan.identity, complete=False)
     return start
+
+
+def check_there(plan: Plan, frames: int | None = None, *, ending: bool = False) -> None:
+    """Raise SvgfError where outputs of the first `frames` frames (all: None) have vanished, of a run to resume or to end."""
+    if gone := [path for path in written(plan, frames) if not is_there(path)]:
+        raise SvgfError(
+            f"Cannot {'end' if ending else 'resume'} the run in {plan.out}: {_list(gone)}, written before, "
+            f"{'is' if len(gone) == 1 else 'are'} gone. Start again with --overwrite."
+        )
 
 
 def find_start(plan: Plan, *, resume: bool, overwrite: bool) -> Checkpoint | None:
@@ -120,9 +135,9 @@ def find_start(plan: Plan, *, resume: bool, overwrite: bool) -> Checkpoint | Non
 
 def check_writable(out: Path) -> None:
     """Raise SvgfError where the folder `out` could not be made or written into. Writes nothing."""
-    there = next(path for path in (out, *out.absolute().parents) if path.exists())
-    if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
-        reason = "not writable" if there.is_dir() else "not a folder"
+    there = next(path for path in (out, *out.absolute().parents) if is_there(path))
+    if not (os.path.isdir(there) and os.access(there, os.W_OK | os.X_OK)):
+        reason = "not writable" if os.path.isdir(there) else "not a folder"
         raise SvgfError(
             f"Cannot write into the output folder {out}: {there} is {reason}. "
             "Wanted a folder that is writable or can be created; try another one."
@@ -140,16 +155,37 @@ def written(plan: Plan, frames: int | None = None) -> Iterator[Path]:
         yield plan.video
 
 
+def is_there(path: Path) -> bool:
+    """Whether there is such a file; what may not be looked at counts as there."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
+    return True
+
+
 def stamp(path: str | None) -> list | None:
-    """What tells that an input is still the same file: name, size, time of change."""
+    """What tells that an input is still the same file: name, size, time of change. Raises SvgfError."""
     if path is None:
         return None
-    status = os.stat(path)
+    try:
+        status = os.stat(path)
+    except OSError as error:
+        raise SvgfError(
+            f"{path}: {error.strerror}, though it was there when the sequence was listed. Put it back, then go on with --resume."
+        ) from error
     return [Path(path).name, status.st_size, status.st_mtime_ns]
 
 
+def stamp_frame(plan: Plan, index: int) -> list:
+    """What tells that the inputs of one frame are still the same files: its number, and the stamp of each."""
+    return [plan.files[index][0], *(stamp(files[index][1]) for files in (plan.files, *plan.others))]
+
+
 def _start(plan: Plan, *, overwrite: bool) -> Checkpoint:
-    there = [path for path in written(plan) if path.exists()]
+    there = [path for path in written(plan) if is_there(path)]
     if there and not overwrite:
         record = checkpoint.load_run(plan.state)
         hint = "--resume continues the unfinished run, " if record is not None and not record[1] else ""
@@ -172,22 +208,14 @@ def _resume(plan: Plan) -> Checkpoint | None:
                 f"The run in {plan.out} is complete with {len(saved['frames'])} frames; the input has now "
                 f"{len(plan.files)}. Use --overwrite, or another output folder, to denoise them all."
             )
-        _check_there(plan, None)
+        check_there(plan)
         return None
     start = checkpoint.load_checkpoint(plan.state, plan.identity)
     if start is None:
         checkpoint.check_same(plan.state, saved, plan.identity, used=0)
         return Checkpoint(0, None)
-    _check_there(plan, start.next_index)
+    check_there(plan, start.next_index)
     return start
-
-
-def _check_there(plan: Plan, frames: int | None) -> None:
-    if gone := [path for path in written(plan, frames) if not path.exists()]:
-        raise SvgfError(
-            f"Cannot resume the run in {plan.out}: {_list(gone)}, written before, "
-            f"{'is' if len(gone) == 1 else 'are'} gone. Start again with --overwrite."
-        )
 
 
 def _remove_temporary(plan: Plan) -> None:

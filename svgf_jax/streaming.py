@@ -5,7 +5,6 @@ JAX is imported once the first frame has been read, so that every error before t
 
 import contextlib
 import os
-import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -20,7 +19,7 @@ from svgf_jax.checkpoint import Checkpoint
 from svgf_jax.compiled import Filters, Pipeline, check_devices, compile_filters, to_host
 from svgf_jax.methods import MethodConfig
 from svgf_jax.outputs import WriteOptions
-from svgf_jax.plan import Files, Plan, begin, make_plan, stamp, written
+from svgf_jax.plan import Files, Plan, begin, check_there, is_there, make_plan, stamp, stamp_frame, written
 from svgf_jax.threads import Submit, read_ahead, write_behind
 from svgf_jax.types import Config, History, Output, Params, SvgfError
 
@@ -167,17 +166,19 @@ def run(
         device_name.append(made.device)
         return made
 
-    with _nothing_half_written(plan), checkpoint.lock(plan.state):
+    new = not is_there(plan.out), not is_there(plan.state)
+    with checkpoint.lock(plan.state) as still_locked, _nothing_half_written(plan, *new):
         start = begin(plan, resume=resume, overwrite=overwrite)
         end = len(plan.files)
         if start is not None:
-            read = partial(_read, source)
-            write = partial(_write, source, plan, options, provenance, on_output)
+            read = partial(_read, source, plan)
+            write = partial(_write, source, plan, options, provenance, on_output, still_locked)
             loaded = read_ahead(read, range(start.next_index, end), threads=threads)
             with write_behind(done, threads=threads) as submit, contextlib.closing(loaded):
                 keep = on_output is not None
                 end = _filter(plan, start, loaded, filters, write, submit, stop, checkpoint_every, keep_frames=keep)
         if start is not None and end == len(plan.files):
+            check_there(plan, end, ending=True)
             if plan.video is not None:
                 preview.write_video(plan.video, _pictures(plan, options), fps=fps)
             checkpoint.save_run(plan.state, plan.identity, complete=True)
@@ -295,10 +296,21 @@ def _camera_files(source: frames.Source) -> list[Files]:
     return [source.cameras.files] if source.cameras and source.cameras.files else []
 
 
-def _read(source: frames.Source, index: int) -> frames.LoadedFrame | None:
+def _read(source: frames.Source, plan: Plan, index: int) -> frames.LoadedFrame | None:
+    """One frame. Of a file that was replaced since the run began, the new content counts, and the run's record says so."""
     if source.sequence.files[index][1] is None:
         return None
+    before = stamp_frame(plan, index)
     item = frames.read_frame(source, index)
+    if stamp_frame(plan, index) != before:
+        raise SvgfError(
+            f"{item.path}: this frame's files changed while they were read. Go on with --resume once they are complete."
+        )
+    if before != plan.identity["frames"][index]:
+        plan.identity["frames"][index] = before
+        item = item._replace(
+            notes=(*item.notes, f"{item.path} changed while the run went on; taken as it was when read")
+        )
     if (np.asarray(item.frame.object_id) == -1).all():
         item = item._replace(notes=(*item.notes, "a frame without any surface: it passed through unfiltered"))
     return item
@@ -327,6 +339,7 @@ def _write(
     options: WriteOptions,
     provenance: Mapping[str, str],
     on_output: Callable[[frames.LoadedFrame, Output], object] | None,
+    still_locked: Callable[[], None],
     index: int,
     item: frames.LoadedFrame,
     output: Output,
@@ -343,6 +356,7 @@ def _write(
         output, item.image, options=options, signals=source.roles.signals, attributes=provenance
     )
     notes = list(item.notes)
+    still_locked()
     if dropped := outputs.write_frame(path, image, options=options):
         notes.append(f"header attributes that could not be passed through: {', '.join(dropped)}")
     broken = int(np.count_nonzero(~np.isfinite(output.image).all(axis=-1)))
@@ -375,14 +389,13 @@ def _pictures(plan: Plan, options: WriteOptions) -> Iterator[np.ndarray]:
 
 
 @contextlib.contextmanager
-def _nothing_half_written(plan: Plan) -> Iterator[None]:
-    """Where a run fails before its first output, leave no trace of it."""
-    new_out, new_state, state = not plan.out.exists(), not plan.state.exists(), plan.state
+def _nothing_half_written(plan: Plan, new_out: bool, new_state: bool) -> Iterator[None]:
+    """Where a run fails before its first output, leave no trace of it: of the folders, those that are new. Needs the lock."""
     try:
         yield
     except BaseException:
-        if new_state and not ((state / "run.json").exists() and any(path.exists() for path in written(plan))):
-            shutil.rmtree(state, ignore_errors=True)
+        if new_state and not (is_there(plan.state / "run.json") and any(map(is_there, written(plan)))):
+            checkpoint.remove_state(plan.state)
         if new_out:
             with contextlib.suppress(OSError):  # not empty
                 plan.out.rmdir()
