@@ -78,7 +78,11 @@ def launch(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command and exit: 0, 2 for an error that its message explains, 130 or 143 when interrupted."""
+    """Run a command and exit: 0, 2 for an error that its message explains, 129, 130 or 143 when interrupted.
+
+    Where whoever read the output has had enough (`| head`) it ends quietly: with 141 if there was more to come.
+    """
+    terminal.open_streams()
     try:
         code = app.meta(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
@@ -87,15 +91,38 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except SvgfError as error:
         fail(str(error))
     except KeyboardInterrupt:
-        print("svgf-jax: interrupted; files with their final name are complete", file=sys.stderr)
-        sys.exit(130)
-    except BrokenPipeError:  # `| head`: whoever read the output has had enough
-        sys.stderr.close()
-        sys.exit(0)
-    sys.exit(code if isinstance(code, int) else 0)
+        terminal.tell("svgf-jax: interrupted; files with their final name are complete")
+        leave(130)
+    except (BrokenPipeError, SystemExit) as error:
+        if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
+            raise
+        terminal.silence(sys.stdout)  # rich makes a SystemExit of it
+        leave(141)
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        leave(_not_printed(error))  # files are written under their names
+    leave(code if isinstance(code, int) else 0)
+
+
+def leave(code: int) -> NoReturn:
+    """Exit, with all that was printed handed over; with 2 where it could not be."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        terminal.silence(sys.stdout)
+    except OSError as error:
+        code = code or _not_printed(error)
+    sys.exit(code)
+
+
+def _not_printed(error: OSError) -> int:
+    terminal.silence(sys.stdout)
+    terminal.tell(f"svgf-jax: Could not write the standard output: {error.strerror}.")
+    return 2
 
 
 def fail(message: str) -> NoReturn:
     """Tell an error and exit with 2."""
     terminal.tell(f"svgf-jax: {message}")
-    sys.exit(2)
+    leave(2)

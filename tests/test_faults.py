@@ -1,6 +1,9 @@
 """Faults that strike a run, the short way, with a filter that needs no compiling; the long way is tests/bench/faults.py."""
 
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -171,6 +174,55 @@ def test_a_run_that_comes_second_touches_nothing_of_the_first(shot, tmp_path, mo
     with pytest.raises(SvgfError, match="Another run is writing"):
         run(shot, tmp_path / "out")
     assert (state / "run.json").read_text() == "the first one's"
+
+
+# The terminal
+
+
+def shell(line, *arguments):
+    """(exit code of the command, standard error) of a shell line with the command in it as "$@"."""
+    call = ["bash", "-c", f"{line}; exit ${{PIPESTATUS[0]}}", "-", sys.executable, *arguments]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(call, env=environment, capture_output=True, text=True, timeout=60)
+    return done.returncode, done.stderr
+
+
+PARAMS = ("-m", "svgf_jax", "params", "list")
+
+
+@pytest.mark.parametrize(
+    ("line", "codes", "told"),
+    [
+        ('"$@" | true', {0, 141}, ""),
+        ('"$@" > /dev/full', {2}, "svgf-jax: Could not write the standard output: No space left on device.\n"),
+        ('"$@" <&- >&- 2>&-', {0}, ""),
+    ],
+)
+def test_a_standard_output_that_leads_nowhere(line, codes, told):
+    code, error = shell(line, *PARAMS)
+    assert code in codes
+    assert error == told
+
+
+STOPPED = """
+import os, signal, sys
+from svgf_jax.commands import denoise, terminal
+if len(sys.argv) > 1:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+with denoise._until_interrupted() as received:
+    os.kill(os.getpid(), signal.SIGHUP)
+for _ in range(1000):
+    terminal.tell("nobody reads this")
+sys.exit(100 + sum(received))
+"""
+
+
+def test_messages_that_nobody_reads_do_not_end_a_run():
+    assert shell('"$@" 2>&1 | true', "-c", STOPPED, "nohup") == (100, "")
+
+
+def test_a_terminal_that_is_closed_stops_the_run_after_its_frame():
+    assert shell('"$@"', "-c", STOPPED) == (100 + signal.SIGHUP, "")
 
 
 def test_a_video_has_the_same_bytes_every_time(tmp_path):

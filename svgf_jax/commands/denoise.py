@@ -212,15 +212,21 @@ def _conclude(summary: "Summary", *, verbose: bool) -> None:
 
 @contextmanager
 def _until_interrupted() -> Iterator[list[int]]:
-    """A list that receives the number of a SIGINT or SIGTERM; a second SIGINT interrupts at once."""
+    """A list that receives the number of a SIGINT, SIGTERM or SIGHUP; a second SIGINT interrupts at once."""
     received: list[int] = []
 
     def on_signal(number: int, _: object) -> None:
         received.append(number)
+        if number == hangup:  # the terminal is gone
+            terminal.silence(sys.stderr)
         terminal.tell("stopping after this frame" + ("; Ctrl-C again stops at once" if number == signal.SIGINT else ""))
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    hangup = getattr(signal, "SIGHUP", None)
+    if hangup is not None and signal.getsignal(hangup) == signal.SIG_IGN:  # nohup
+        hangup = None
+    caught = [number for number in (signal.SIGINT, signal.SIGTERM, hangup) if number is not None]
+    before = {number: signal.signal(number, on_signal) for number in caught}
     try:
         yield received
     finally:

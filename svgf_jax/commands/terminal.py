@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import sys
 import time
@@ -40,8 +41,27 @@ def visible(text: str) -> str:
 
 
 def tell(text: str) -> None:
-    """One message on the standard error."""
-    print(visible(text), file=sys.stderr, flush=True)
+    """One message on the standard error. Where nobody can read it any more, the work goes on all the same."""
+    try:
+        print(visible(text), file=sys.stderr, flush=True)
+    except OSError:  # `2>&1 | head`, a log on a full disk, a terminal that was closed
+        silence(sys.stderr)
+
+
+def silence(stream: Any) -> None:
+    """Send what is still to come on a standard stream nowhere."""
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), stream.fileno())
+
+
+def open_streams() -> None:
+    """Standard streams that a command was given closed (`2>&-`) lead nowhere; else its files would get their numbers."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(number)
+    for name, number, mode in (("stdin", 0, "r"), ("stdout", 1, "w"), ("stderr", 2, "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115 (as the others)
 
 
 def warn(texts: Iterable[str]) -> None:
@@ -77,8 +97,11 @@ def duration(seconds: float) -> str:
 
 
 def print_json(value: Any) -> None:
-    """`value` as JSON on the standard output."""
-    print(to_json(value))
+    """`value` as JSON on the standard output; where nobody reads it any more, nowhere: it comes last, the work is done."""
+    try:
+        print(to_json(value), flush=True)
+    except BrokenPipeError:
+        silence(sys.stdout)
 
 
 def to_json(value: Any) -> str:
