@@ -241,8 +241,9 @@ def test_an_interrupted_command_resumes_to_the_same_bits(long, number):
     while "frame 2:" not in process.stderr.readline():
         assert process.poll() is None
     process.send_signal(number)
-    told = process.communicate(timeout=60)[1]
-    assert process.returncode == 128 + number
+    with process.stderr:
+        told = process.stderr.read()  # not communicate(): it would miss what readline() has read ahead
+    assert process.wait(60) == 128 + number
     assert "Traceback" not in told
     assert f"Continue with: svgf-jax {' '.join(LONG)} {out.name} --resume" in told
     assert not list(out.glob(".*.tmp"))
@@ -283,7 +284,9 @@ def test_killed_at_any_moment_resumes_to_the_same_bits(tmp_path):
     process = start("whole")
     process.stdout.readline()
     began = time.monotonic()
-    assert len(process.communicate(timeout=120)[0].split()) == 59
+    with process.stdout:  # not communicate(): it would miss what readline() has read ahead
+        assert len(process.stdout.read().split()) == 59
+    assert process.wait(120) == 0
     took = time.monotonic() - began
     wanted = {path.name: path.read_bytes() for path in (tmp_path / "whole").glob("*.*") if path.is_file()}
     landed = []
@@ -292,11 +295,13 @@ def test_killed_at_any_moment_resumes_to_the_same_bits(tmp_path):
         process.stdout.readline()  # the first frame is done
         time.sleep(rng.uniform(0, 0.6 * took))
         process.kill()
-        process.communicate()
+        process.stdout.close()
+        process.wait()
         landed.append(len(list((tmp_path / f"out{i}").glob("*.exr"))))
         process = start(f"out{i}")
-        process.communicate(timeout=120)
-        assert process.returncode == 0
+        with process.stdout:
+            process.stdout.read()
+        assert process.wait(120) == 0
         got = {path.name: path.read_bytes() for path in (tmp_path / f"out{i}").glob("*.*") if path.is_file()}
         assert got == wanted
     assert any(1 <= count < 60 for count in landed), landed
