@@ -1,10 +1,14 @@
 """Memory, overlap and start of `svgf-jax denoise`, run as a person runs it, on files of a few frames that are linked many times.
 
-    python tests/bench/long_runs.py [memory] [overlap] [start] [--rounds 3]
+    python tests/bench/long_runs.py [memory] [overlap] [start] [endless] [drift] [restarts] [--rounds 3] [--minutes 60]
 
 memory: peak resident set at 1920x1080 and 3840x2160 with two signals, for ten frames and (at 1920x1080) for --long of them.
 overlap: wall time of a run at 1920x1080, ZIP, beside the larger of reading and writing alone, and filtering alone.
 start: seconds from the command to the first written frame at 480x270.
+endless: resident memory, open files and threads over --endless frames of 240x135 (1.6 GB of disk; Linux).
+drift: float32 against float64 over --endless frames on arrays: the variance from the accumulated moments, by how much larger
+the mean is than the deviation; and the whole filter with alpha = 0 and a history without end.
+restarts: SIGINT, SIGTERM and kill -9 at random moments of runs that are resumed until they are done, for --minutes (see faults.py).
 
 Prints Markdown tables.
 """
@@ -57,9 +61,9 @@ def denoise(folder: Path, out: Path, *options: str) -> tuple[float, float]:
     return time.monotonic() - began, used.ru_maxrss / 1e6
 
 
-def bench_memory(folder: Path, long: int, rounds: int) -> list[str]:
+def bench_memory(folder: Path, options: argparse.Namespace) -> list[str]:
     lines = ["| denoise | frames | peak resident set, GB |", "|---|---|---|"]
-    for height, width, frames in ((1080, 1920, 10), (1080, 1920, long), (2160, 3840, 10)):
+    for height, width, frames in ((1080, 1920, 10), (1080, 1920, options.long), (2160, 3840, 10)):
         shot = folder / f"{width}-{frames}"
         write_sequence(shot, height, width, frames)
         _, peak = denoise(shot, folder / f"clean-{width}-{frames}")
@@ -67,7 +71,7 @@ def bench_memory(folder: Path, long: int, rounds: int) -> list[str]:
     return lines
 
 
-def bench_overlap(folder: Path, long: int, rounds: int) -> list[str]:
+def bench_overlap(folder: Path, options: argparse.Namespace) -> list[str]:
     """Reading alone, writing alone and filtering alone are timed in this process, the run in its own, its first frame left out."""
     import jax
 
@@ -78,7 +82,7 @@ def bench_overlap(folder: Path, long: int, rounds: int) -> list[str]:
     source = sj.open_source(shot)
     params, config = sj.preset("paper")
     spent = {"reading and writing": [], "filtering": [], "run": []}
-    for i in range(rounds):
+    for i in range(options.rounds):
         one, _ = denoise(shot, folder / f"one-{i}", "--frames", "0-1")
         whole, _ = denoise(shot, folder / f"all-{i}")
         spent["run"].append((whole - one) / (frames - 2))
@@ -103,13 +107,163 @@ def bench_overlap(folder: Path, long: int, rounds: int) -> list[str]:
     ]
 
 
-def bench_start(folder: Path, long: int, rounds: int) -> list[str]:
+def bench_start(folder: Path, options: argparse.Namespace) -> list[str]:
     write_sequence(folder / "start", 270, 480, 1)
-    spent = [denoise(folder / "start", folder / f"started-{i}")[0] for i in range(rounds)]
+    spent = [denoise(folder / "start", folder / f"started-{i}")[0] for i in range(options.rounds)]
     return [f"Command to first written frame, 480x270: {np.median(spent):.1f} s."]
 
 
-BENCHES = {"memory": bench_memory, "overlap": bench_overlap, "start": bench_start}
+def bench_endless(folder: Path, options: argparse.Namespace) -> list[str]:
+    write_sequence(folder / "shot", 135, 240, options.endless)
+    command = [
+        sys.executable,
+        "-m",
+        "svgf_jax",
+        "denoise",
+        str(folder / "shot"),
+        "-o",
+        str(folder / "out"),
+        "--only-denoised",
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    samples = []
+    for line in process.stderr:
+        if line.startswith("frame ") and int(line.split()[1].rstrip(":")) % 100 == 50:
+            status = Path(f"/proc/{process.pid}/status").read_text().splitlines()
+            figures = {
+                name: int(rest.split()[0]) for name, _, rest in (line.partition(":") for line in status) if name in KEPT
+            }
+            files = len(os.listdir(f"/proc/{process.pid}/fd"))
+            frame = int(line.split()[1].rstrip(":"))
+            samples.append((frame, figures["VmRSS"] / 1e3, files, figures["Threads"]))
+            print(samples[-1], file=sys.stderr, flush=True)
+    if process.wait():
+        raise SystemExit(f"{' '.join(command)} failed")
+    frames, memory = (np.array([sample[k] for sample in samples[len(samples) // 5 :]]) for k in (0, 1))
+    growth = np.polyfit(frames, memory, 1)[0] * 1000
+    shown = [samples[round(part * (len(samples) - 1))] for part in (0, 0.2, 0.4, 0.6, 0.8, 1)]
+    return [
+        "| frame | resident, MB | open files | threads |",
+        "|---|---|---|---|",
+        *(f"| {frame} | {size:.0f} | {files} | {threads} |" for frame, size, files, threads in shown),
+        "",
+        f"Growth after the first fifth: {growth:+.2f} MB in 1000 frames; at most {max(s[2] for s in samples)} open files and "
+        f"{max(s[3] for s in samples)} threads.",
+    ]
+
+
+def bench_drift(folder: Path, options: argparse.Namespace) -> list[str]:
+    """Still pictures of noise around a mean; the float64 run sees the very same float32 numbers."""
+    import jax
+    import jax.numpy as jnp
+
+    import svgf_jax as sj
+
+    jax.config.update("jax_enable_x64", True)
+    height, width = 16, 16
+    still = jax.tree.map(lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a, some_frame(height, width, 1))
+    still = still._replace(motion=still.motion * 0, object_id=still.object_id * 0, albedo=still.albedo * 0 + 1)
+
+    def picture(key, ratio):
+        noise = jax.random.normal(key, (1, height, width, 1), jnp.float32)
+        return jnp.maximum(1 + noise / jnp.sqrt(ratio).astype(jnp.float32), 0) * jnp.ones(3, jnp.float32)
+
+    def frame(key, ratio, dtype):
+        made = still._replace(radiance=picture(key, ratio).astype(jnp.float64))
+        return jax.tree.map(lambda a: a.astype(dtype) if a.dtype == jnp.float64 else a, made)
+
+    def both(alpha, most):
+        """At each frame the largest relative error of the variance over the picture, with one ratio."""
+        config = sj.Config()
+        params = sj.Params(alpha=alpha, alpha_moments=alpha, max_history=most)
+
+        def variance(history, made):
+            previous = sj.reproject(history, made, params=params, config=config)
+            blended = sj.accumulate(made.radiance, previous, made, params=params, config=config)
+            history = history._replace(
+                illumination=blended.illumination, moments=blended.moments, history_length=blended.history_length,
+                depth=made.depth, normal=made.normal, object_id=made.object_id,
+            )  # fmt: skip
+            first, second = blended.moments[..., 0], blended.moments[..., 1]
+            return history, jnp.maximum(second - first * first, 0)
+
+        def go(histories, key_and_ratio):
+            frames = [frame(*key_and_ratio, dtype) for dtype in (jnp.float32, jnp.float64)]
+            pairs = [variance(history, made) for history, made in zip(histories, frames, strict=True)]
+            (small, low), (large, high) = pairs
+            return (small, large), jnp.median(jnp.abs(low.astype(jnp.float64) - high) / high)
+
+        @jax.jit
+        def run(ratio):
+            keys = jax.random.split(jax.random.key(0), options.endless)
+            first = tuple(sj.init(frame(keys[0], ratio, dtype)) for dtype in (jnp.float32, jnp.float64))
+            return jax.lax.scan(lambda h, key: go(h, (key, ratio)), first, keys)[1]
+
+        return run
+
+    lines = [
+        "| mean^2 / variance | alpha_moments .2: frame 100 | last frame | 0, all frames alike: frame 100 | last frame |"
+    ]
+    lines.append("|---|---|---|---|---|")
+    runs = (both(0.2, 32.0), both(0.0, 1e9))
+    for ratio in (1.0, 1e2, 1e3, 1e4, 1e5, 1e6):
+        errors = [np.asarray(run(jnp.float64(ratio))) for run in runs]
+        cells = [f"{value:.1e}" for error in errors for value in (np.median(error[50:150]), np.median(error[-100:]))]
+        lines.append(f"| {ratio:.0e} | {' | '.join(cells)} |")
+
+    single = jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, still)
+    params, config = sj.Params(alpha=0.0, alpha_moments=0.0, max_history=1e9), sj.Config()
+
+    @jax.jit
+    def forever(key):
+        def go(history, key):
+            noisy = single._replace(radiance=jax.random.exponential(key, single.radiance.shape, jnp.float32) ** 4)
+            history, output = sj.step(history, noisy, params=params, config=config)
+            finite = [jnp.isfinite(leaf).all() for leaf in jax.tree.leaves((history, output))]
+            return history, (jnp.stack(finite).all(), output.image.mean())
+
+        return jax.lax.scan(go, sj.init(single), jax.random.split(key, options.endless))
+
+    history, (finite, mean) = forever(jax.random.key(1))
+    told = "all finite" if np.asarray(finite).all() else "NOT FINITE"
+    lines += [
+        "",
+        f"alpha = alpha_moments = 0, max_history = 1e9, {options.endless} frames of noise of mean 24 with a long tail: {told}, "
+        f"history length at the end {float(history.history_length.min()):.0f}, mean of the picture {float(mean[-1]):.3f}.",
+    ]
+    return lines
+
+
+def bench_restarts(folder: Path, options: argparse.Namespace) -> list[str]:
+    import random
+
+    from struck_runs import FRAMES, prepare, stopped_until_done
+
+    place = prepare(folder, random.Random(options.seed))
+    ends = time.monotonic() + 60 * options.minutes
+    began, runs, stops = time.monotonic(), 0, {"SIGINT": 0, "SIGTERM": 0, "SIGKILL": 0}
+    while time.monotonic() < ends:
+        enough = lambda: time.monotonic() > ends  # noqa: E731
+        counts = stopped_until_done(place, folder / f"restarted-{runs}", list(stops), enough)
+        stops = {name: count + counts[name] for name, count in stops.items()}
+        runs += 1
+        print(f"{runs} runs, {stops}", file=sys.stderr, flush=True)
+    minutes = (time.monotonic() - began) / 60
+    told = ", ".join(f"{count} {name}" for name, count in stops.items())
+    return [
+        f"{minutes:.0f} minutes, {runs} runs of {FRAMES} frames, {told}: every run ended with the bytes of the undisturbed one."
+    ]
+
+
+KEPT = ("VmRSS", "Threads")
+BENCHES = {
+    "memory": bench_memory,
+    "overlap": bench_overlap,
+    "start": bench_start,
+    "endless": bench_endless,
+    "drift": bench_drift,
+    "restarts": bench_restarts,
+}
 
 
 def main():
@@ -117,10 +271,13 @@ def main():
     parser.add_argument("benches", nargs="*", choices=[[], *BENCHES], default=[])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--long", type=int, default=1000, help="frames of the long run")
+    parser.add_argument("--endless", type=int, default=10_000, help="frames of the run without end")
+    parser.add_argument("--minutes", type=float, default=60, help="of restarts")
+    parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     for name in options.benches or BENCHES:
         with tempfile.TemporaryDirectory() as folder:
-            print("\n".join(BENCHES[name](Path(folder), options.long, options.rounds)), "\n", flush=True)
+            print("\n".join(BENCHES[name](Path(folder), options)), "\n", flush=True)
 
 
 if __name__ == "__main__":
