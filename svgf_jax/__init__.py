@@ -4,7 +4,7 @@ Names are imported when first used: `import svgf_jax` costs nothing, and what ne
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from svgf_jax.accumulation import Accumulated as Accumulated
@@ -111,7 +111,7 @@ _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 __all__ = sorted(_MODULE_OF)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     if name in _MODULE_OF:
         value = getattr(import_module(f"svgf_jax.{_MODULE_OF[name]}"), name)
         globals()[name] = value

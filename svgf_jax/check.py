@@ -1,6 +1,9 @@
 """Checks of shapes and dtypes at the public boundary: they cost nothing at run time, and name what does not fit."""
 
+from typing import Any
+
 import jax.numpy as jnp
+from jax import Array
 
 from svgf_jax.types import Config, Frame, History, Params, SvgfError, TaaHistory, choices_of, is_choice
 
@@ -84,13 +87,13 @@ def check_history(history: History, frame: Frame, config: Config) -> None:
             )
 
 
-def check_image(image) -> None:
+def check_image(image: Array) -> None:
     """Raise `SvgfError` unless this is one image `[H, W, 3]` of float32 or float64."""
     if image.ndim != 3 or image.shape[-1] != 3 or image.dtype not in (jnp.float32, jnp.float64):
         raise SvgfError(f"the image is {image.dtype} {tuple(image.shape)}; wanted float32 or float64 [H, W, 3]")
 
 
-def check_taa(history: TaaHistory, image, motion, depth) -> None:
+def check_taa(history: TaaHistory, image: Array, motion: Array, depth: Array) -> None:
     """Raise `SvgfError` unless the arrays of `taa` fit together."""
     check_image(image)
     height, width, _ = image.shape
@@ -122,7 +125,7 @@ def check_sequence(frames: Frame) -> None:
         raise SvgfError(f"the frames' arrays have lengths {lengths}; wanted one length T >= 1 for all")
 
 
-def check_params(params: Params, config: Config, *, dtype) -> Params:
+def check_params(params: Params, config: Config, *, dtype: Any) -> Params:
     """The parameters as arrays of `dtype`; raise `SvgfError` unless each is a scalar or has one value per level."""
     for name, value in config._asdict().items():
         if not is_choice(name, value):

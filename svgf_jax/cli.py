@@ -22,7 +22,7 @@ from svgf_jax.commands.project import use_project
 from svgf_jax.commands.video import video
 from svgf_jax.types import SvgfError
 
-app = App(
+app: App = App(
     name="svgf-jax",
     help="Denoise path-traced EXR sequences with spatiotemporal variance-guided filtering (SVGF).",
     help_epilogue="`svgf-jax demo` shows it at work on a small bundled sequence.",
@@ -35,7 +35,7 @@ app.command(compare)
 app.command(ablate)
 app.command(demo)
 app.command(video)
-params = App(name="params", help="Show and compare presets, methods and parameter files.", help_format="plaintext")
+params: App = App(name="params", help="Show and compare presets, methods and parameter files.", help_format="plaintext")
 params.command(list_, name="list")
 params.command(show)
 params.command(diff)

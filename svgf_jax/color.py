@@ -1,5 +1,7 @@
 """Colour arithmetic: luminance, and demodulation by albedo."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jax import Array
 
@@ -16,7 +18,7 @@ def luminance_of_planes(red: Array, green: Array, blue: Array) -> Array:
     return LUMINANCE[0] * red + LUMINANCE[1] * green + LUMINANCE[2] * blue
 
 
-def largest_luminance(dtype) -> float:
+def largest_luminance(dtype: Any) -> float:
     """Squares of luminances up to this, and sums of them with weights, stay finite."""
     return float(jnp.finfo(dtype).max) ** 0.5 / 2**6
 

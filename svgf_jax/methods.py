@@ -135,7 +135,7 @@ METHODS: dict[str, Method] = {
 
 BOUNDS = dict.fromkeys(Games202Params._fields, (0.0, math.inf)) | {"alpha": (0.0, 1.0)}
 """Where each number may lie: (least, most), both included; infinity is not a number."""
-METHOD_CHOICES: dict[str, range | tuple] = {
+METHOD_CHOICES: dict[str, range | tuple[Any, ...]] = {
     "filter": ("none", "gaussian", "bilateral", "joint-bilateral"),
     "radius": range(129),
     "footprint": ("full", "separable", "atrous"),

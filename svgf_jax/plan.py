@@ -166,7 +166,7 @@ def is_there(path: Path) -> bool:
     return True
 
 
-def stamp(path: str | None) -> list | None:
+def stamp(path: str | None) -> list[str | int] | None:
     """What tells that an input is still the same file: name, size, time of change. Raises SvgfError."""
     if path is None:
         return None

@@ -251,7 +251,7 @@ class Config(NamedTuple):
     prefilter: bool = True
 
 
-CHOICES: dict[str, range | tuple] = {
+CHOICES: dict[str, range | tuple[Any, ...]] = {
     "levels": range(13),
     "feedback_level": range(-1, 13),
     "light_cell": range(13),
@@ -285,12 +285,12 @@ def unread(config: Config) -> frozenset[str]:
     return frozenset(name for name, (choice, values) in _READ_WHERE.items() if getattr(config, choice) not in values)
 
 
-def is_choice(name: str, value: Any, *, choices: Mapping[str, range | tuple] = CHOICES) -> bool:
+def is_choice(name: str, value: Any, *, choices: Mapping[str, range | tuple[Any, ...]] = CHOICES) -> bool:
     """Whether a field of `Config` may have this value: True is not 1."""
     return any(type(value) is type(one) and value == one for one in choices[name])
 
 
-def choices_of(name: str, *, choices: Mapping[str, range | tuple] = CHOICES) -> str:
+def choices_of(name: str, *, choices: Mapping[str, range | tuple[Any, ...]] = CHOICES) -> str:
     """The values that a field of `Config` may have, in words."""
     values = choices[name]
     if isinstance(values, range):

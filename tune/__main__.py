@@ -11,7 +11,7 @@ from svgf_jax.cli import app as svgf_jax
 from svgf_jax.commands.project import use_project
 from tune.command import command
 
-app = App(
+app: App = App(
     name="svgf-tune",
     help="Fit the filter's numbers to a renderer's own noise.",
     help_epilogue="The result: svgf-jax denoise INPUT -o FOLDER --params tuned.toml",

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tune.fitting import Fit
     from tune.shots import Shot
 
-Repeated = Parameter(negative=(), consume_multiple=True, show_default=False)
+Repeated: Parameter = Parameter(negative=(), consume_multiple=True, show_default=False)
 SECOND = ("alt", "second", "noisy2")  # what the second render is called in a folder
 MAPS = "sensitivity.exr"  # as `explore.write_maps` calls it
 WHAT, HOW, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["What", "How", "Output"], 1))

@@ -114,7 +114,11 @@ NOISY = (
 """The terms for a second noisy render; its noise is most of the error, so the prior is smaller against it."""
 
 SPACES = {"reinhard": image_error, "log1p": log_error}
-ROBUST = {"none": None, "huber": huber, "geman-mcclure": geman_mcclure}
+ROBUST: dict[str, Callable[[Residual, float], Residual] | None] = {
+    "none": None,
+    "huber": huber,
+    "geman-mcclure": geman_mcclure,
+}
 
 
 def reference_terms(

@@ -162,7 +162,9 @@ def _take(future: Future, triangle: np.ndarray, scatter: np.ndarray) -> float:
     return loss
 
 
-def frame_blocks(problem: Problem, index: int, shot: Shot, y: np.ndarray, linear: bool) -> Generator[tuple, None, None]:
+def frame_blocks(
+    problem: Problem, index: int, shot: Shot, y: np.ndarray, linear: bool
+) -> Generator[tuple[Any, list[Any]], None, None]:
     """(residual, columns) of each frame of a shot: `[m]`, and a list of `[k, m]` that together are `[n, m]`."""
     run, coordinates = problem.frame_pass, problem.coordinates
     n = len(coordinates.free)

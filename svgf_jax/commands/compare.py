@@ -21,7 +21,7 @@ COLUMNS = {
     "temporal": ("temporal error", "{:.4f}"),
     "flip": ("HDR-FLIP", "{:.4f}"),
 }
-Flag = Parameter(negative=(), show_default=False)
+Flag: Parameter = Parameter(negative=(), show_default=False)
 
 
 def compare(

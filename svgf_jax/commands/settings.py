@@ -46,8 +46,8 @@ def choose_method(
 
 
 INPUT = Group("Input", sort_key=0)
-Flag = Parameter(negative=(), show_default=False)
-Repeated = Parameter(negative=(), consume_multiple=False, show_default=False)
+Flag: Parameter = Parameter(negative=(), show_default=False)
+Repeated: Parameter = Parameter(negative=(), consume_multiple=False, show_default=False)
 
 
 @Parameter(name="*")
