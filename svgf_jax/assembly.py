@@ -14,7 +14,7 @@ from svgf_jax.cameras import (
     reproject,
 )
 from svgf_jax.motion import convert, parse_convention
-from svgf_jax.planes import guides, in_world, light
+from svgf_jax.planes import guides, in_world, light, light_roles
 from svgf_jax.reflections import signals_reflected
 from svgf_jax.roles import Roles, short_names
 from svgf_jax.types import Frame, SvgfError
@@ -71,7 +71,7 @@ def assemble(
 
     Args:
         roles: what the planes mean.
-        planes: the channels of each role, `[H, W, C]`, as the renderer has them.
+        planes: the channels of each role, `[H, W, C]`, as the renderer has them; those of light are taken out, for they are large.
         place: where the frame stands.
         half: the roles that are stored in half float.
         position: whether the frame gets its world positions.
@@ -81,6 +81,8 @@ def assemble(
     notes: list[str] = []
     with np.errstate(all="ignore"):  # whatever is not finite is dealt with by name below, or by the filter
         radiance, albedo, emission = light(roles, planes, counts)
+        for role in light_roles(roles) & planes.keys():
+            del planes[role]
         camera = None if place.cameras is None else find_camera(place.cameras, place.number)
         planes = in_world(roles, planes, camera, place.origin)
         object_id, normal, depth = guides(roles, planes, radiance.shape[1:3], counts)
@@ -152,7 +154,7 @@ def _past(
             "a cameras.json would tell the whole way."
         )
     sky = (object_id == -1)[..., None]
-    return np.where(sky & ~np.isfinite(motion), 0, motion).astype(np.float32), prev_depth
+    return np.where(sky & ~np.isfinite(motion), 0, motion).astype(np.float32, copy=False), prev_depth
 
 
 def _position(

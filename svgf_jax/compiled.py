@@ -1,12 +1,13 @@
 """The filter compiled for a device, with its parameters there. Imports JAX when first used, not before."""
 
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache, partial
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
+from svgf_jax import memory
 from svgf_jax.methods import MethodConfig
 from svgf_jax.types import Config, Frame, History, Output, SvgfError
 
@@ -61,9 +62,20 @@ def compile_filters(
 
         put = partial(spread, devices=chosen, config=cast(Config, config))  # `check_devices` saw to it
     jitted_init, jitted_step = _jitted(init, step, config, leave_out, chosen)
+    compiled = False
+
+    def filtered(history: History, frame: Frame) -> tuple[History, Output]:
+        nonlocal compiled
+        arguments = (*put((history, frame)), numbers)
+        if not compiled:  # apart, so that its memory is given back before the frame needs its own
+            jitted_step.lower(*arguments).compile()
+            memory.give_back()
+            compiled = True
+        return jitted_step(*arguments)
+
     return Filters(
         init=lambda frame: jitted_init(put(frame)),
-        step=lambda history, frame: jitted_step(*put((history, frame)), numbers),
+        step=filtered,
         device=f"{f'{devices} x ' if devices > 1 else ''}{chosen[0].platform}: {chosen[0].device_kind}",
     )
 
@@ -85,7 +97,7 @@ def _jitted(
     config: Config | MethodConfig,
     leave_out: tuple[str, ...],
     devices: tuple[Any, ...],
-) -> tuple[Callable, Callable]:
+) -> tuple[Callable, Any]:
     """Compiled once a process, however many sequences it denoises."""
     import jax
 
@@ -139,8 +151,24 @@ def to_host(result: Result, name: str) -> Result:
     """
     import jax
 
-    try:
+    with _enough_memory(name):
         return jax.tree.map(np.array, result)
+
+
+def wait(result: Result, name: str) -> Result:
+    """The same result once it is there. Raises as `to_host`."""
+    import jax
+
+    with _enough_memory(name):
+        return jax.block_until_ready(result)
+
+
+@contextmanager
+def _enough_memory(name: str) -> Iterator[None]:
+    import jax
+
+    try:
+        yield
     except jax.errors.JaxRuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise

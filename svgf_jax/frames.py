@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from svgf_jax import exr, renderers
+from svgf_jax import exr, memory, renderers
 from svgf_jax.advising import advice
 from svgf_jax.assembly import IN_FRAME, Place, assemble, check_roles, meaning_of
 from svgf_jax.camera_files import find_cameras
@@ -298,5 +298,7 @@ def _read(path: str, source: Source) -> exr.Image:
 
 def _stack(image: exr.Image, channels: tuple[str, ...]) -> np.ndarray:
     """`[H, W, C]` float32, or float64 for 32-bit integers, which float32 does not hold."""
-    planes = np.stack([image.channels[name] for name in channels], -1)
-    return planes.astype(np.float64 if planes.dtype == np.uint32 else np.float32)
+    pixels = [image.channels[name] for name in channels]
+    whole = all(plane.dtype == np.uint32 for plane in pixels)
+    out = memory.zeros((*pixels[0].shape, len(pixels)), np.float64 if whole else np.float32)
+    return np.stack(pixels, -1, out=out)

@@ -3,8 +3,11 @@
 `planes` holds by role what the file has, `[H, W, C]` float32; what its numbers mean is in the roles' layers.
 """
 
+from typing import Any
+
 import numpy as np
 
+from svgf_jax import memory
 from svgf_jax.cameras import Camera, eye_ray_lengths, from_camera, position_residual
 from svgf_jax.roles import REST, Roles
 
@@ -28,9 +31,10 @@ def light(
     """
     emitted = [planes[role] for role in ("emission", "environment") if role in planes]
     shape = next(iter(planes.values())).shape[:2]
-    emission = sum(emitted[1:], emitted[0]) if emitted else np.zeros((*shape, 3), np.float32)
-    ones = np.ones((*shape, 3), np.float32)
-    albedos = [planes.get(roles.light[name].albedo, ones) for name in roles.signals]
+    emission = sum(emitted[1:], emitted[0]) if emitted else memory.zeros((*shape, 3))
+    colors = [roles.light[name].albedo for name in roles.signals]
+    white = None if all(color in planes for color in colors) else np.ones((*shape, 3), np.float32)
+    albedos: Any = [planes.get(color, white) for color in colors]
     signals = []
     for name, albedo in zip(roles.signals, albedos, strict=True):
         if name != REST:
@@ -51,7 +55,19 @@ def light(
             counts["rest"] = int((rest > 0).any(-1).sum())
             emission = emission + np.where(np.isfinite(rest), rest, 0)
     names = {roles.layers[one.albedo].channels if one.albedo in roles.layers else () for one in roles.light.values()}
-    return np.stack(signals), np.stack(albedos[:1] if len(names) == 1 else albedos), emission
+    return _stacked(signals), _stacked(albedos[:1] if len(names) == 1 else albedos), emission
+
+
+def light_roles(roles: Roles) -> set[str]:
+    """The planes that `light` reads, and nothing else does."""
+    albedos = {one.albedo for one in roles.light.values()}
+    return {*roles.signals, *albedos, "radiance", "emission", "environment"}
+
+
+def _stacked(images: list[np.ndarray]) -> np.ndarray:
+    if len(images) == 1:
+        return images[0][None]
+    return np.stack(images, out=memory.zeros((len(images), *images[0].shape), np.result_type(*images)))
 
 
 def _without(beauty: np.ndarray, emission: np.ndarray, counts: dict[str, int]) -> np.ndarray:
@@ -142,5 +158,7 @@ def guides(
             unexplained |= np.isposinf(depth)
         counts["guides"] = int((hit & ~surface & unexplained).sum())
     counts["normal"] = int((surface & (np.abs(length - 1) > 0.01)).sum())
-    normal = np.where(surface[..., None], normal / length[..., None], 0).astype(np.float32)
-    return np.where(surface, ids, -1).astype(np.int32), normal, np.where(surface, depth, 0).astype(np.float32)
+    normal = (normal / length[..., None]).astype(np.float32, copy=False)
+    normal[~surface] = 0
+    ids, depth = np.where(surface, ids, -1), np.where(surface, depth, 0)
+    return ids.astype(np.int32, copy=False), normal, depth.astype(np.float32, copy=False)

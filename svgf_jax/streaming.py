@@ -8,20 +8,21 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from svgf_jax import __version__, checkpoint, exr, frames, outputs, preview, tonemapping
+from svgf_jax import __version__, checkpoint, exr, frames, memory, outputs, preview, tonemapping
 from svgf_jax.checkpoint import Checkpoint
-from svgf_jax.compiled import Filters, Pipeline, check_devices, compile_filters, to_host
+from svgf_jax.compiled import Filters, Pipeline, check_devices, compile_filters, to_host, wait
 from svgf_jax.methods import MethodConfig
 from svgf_jax.outputs import WriteOptions
 from svgf_jax.plan import Files, Plan, begin, check_there, is_there, make_plan, stamp, stamp_frame, written
 from svgf_jax.threads import Submit, read_ahead, write_behind
-from svgf_jax.types import Config, History, Output, Params, SvgfError
+from svgf_jax.types import Config, Frame, History, Output, Params, SvgfError
 
 MANY_PIXELS = 2**20
 """Frames of more are read and written one at a time, for the sake of memory."""
@@ -121,7 +122,8 @@ def run(
         overwrite: replace outputs that exist; without it they are an error.
         device: "cpu", "gpu", "gpu:1", ...; None takes JAX's default.
         devices: divide the rows of each frame over so many devices of that kind.
-        threads: frames read ahead, and outputs written behind; None = 2, or 1 where frames are so large that memory counts.
+        threads: frames read ahead, and outputs written behind; 1 = by one thread, in turn. None = 2, or 1 where frames are so
+            large that memory counts.
         on_frame: called in this thread for each frame once its output is complete, in order.
         on_output: called in a background thread with each filtered frame and its output, NumPy arrays, before that is written;
             frames may come in another order. Its `illumination` and `variance_filtered` are None.
@@ -173,8 +175,14 @@ def run(
         if start is not None:
             read = partial(_read, source, plan)
             write = partial(_write, source, plan, options, provenance, on_output, still_locked)
-            loaded = read_ahead(read, range(start.next_index, end), threads=threads)
-            with write_behind(done, threads=threads) as submit, contextlib.closing(loaded):
+            workers = threads if threads == 1 else 2 * threads  # one writes a frame before it reads the next
+            with (
+                ThreadPoolExecutor(workers, thread_name_prefix="svgf-files") as pool,
+                write_behind(done, threads=threads, pool=pool) as submit,
+                contextlib.closing(
+                    read_ahead(read, range(start.next_index, end), threads=threads, pool=pool)
+                ) as loaded,
+            ):
                 keep = on_output is not None
                 end = _filter(plan, start, loaded, filters, write, submit, stop, checkpoint_every, keep_frames=keep)
         if start is not None and end == len(plan.files):
@@ -268,6 +276,7 @@ def _filter(
             history, output = filters.step(filters.init(item.frame) if history is None else history, item.frame)
             if not keep_frames:  # what is written needs only the input's other layers
                 item = item._replace(frame=None)  # type: ignore[arg-type]
+            wait(output, item.path)  # before the next frame is read: frames take memory
             submit(partial(write, index, item, output))
         if stop() and index + 1 < len(plan.files):
             save(index + 1)
@@ -313,7 +322,8 @@ def _read(source: frames.Source, plan: Plan, index: int) -> frames.LoadedFrame |
         )
     if (np.asarray(item.frame.object_id) == -1).all():
         item = item._replace(notes=(*item.notes, "a frame without any surface: it passed through unfiltered"))
-    return item
+    frame, item = list(item.frame), item._replace(frame=None)  # type: ignore[arg-type]
+    return item._replace(frame=Frame(*memory.aligned(frame)))
 
 
 def _pixels(source: frames.Source) -> int:
@@ -347,7 +357,6 @@ def _write(
     """Bring one frame's output to the host and onto the disk. Runs in a background thread."""
     path = plan.outputs[index]
     if path is None:
-        to_host(output.image, item.path)  # waits: frames in the making take memory
         return FrameReport(plan.files[index][0], "warm-up", None, {}, ())
     output = to_host(output, item.path)
     if on_output is not None:

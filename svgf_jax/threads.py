@@ -1,26 +1,28 @@
-"""Reading ahead and writing behind: two small bounded queues over thread pools."""
+"""Reading ahead and writing behind: two small bounded queues over thread pools, or over one that they share."""
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import Any, Protocol, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def read_ahead(read: Callable[[Item], Result], items: Iterable[Item], *, threads: int) -> Generator[Result, None, None]:
+def read_ahead(
+    read: Callable[[Item], Result], items: Iterable[Item], *, threads: int, pool: Executor | None = None
+) -> Generator[Result, None, None]:
     """`map(read, items)`, in order, with up to `threads` of them read before they are asked for.
 
     At most `threads + 1` results exist at a time. What `read` raises comes out where its result would have. Closing the
-    iterator waits for the reads that have begun and drops the others.
+    iterator drops the reads that have not begun, and waits for the others unless they are in a `pool` of the caller.
     """
-    with ThreadPoolExecutor(threads, thread_name_prefix="svgf-read") as pool:
+    with _workers(pool, threads, "svgf-read") as workers:
         pending: deque[Future[Result]] = deque()
         try:
             for item in items:
-                pending.append(pool.submit(read, item))
+                pending.append(workers.submit(read, item))
                 if len(pending) > threads:
                     yield pending.popleft().result()
             while pending:
@@ -37,7 +39,7 @@ class Submit(Protocol):
 
 
 @contextmanager
-def write_behind(done: Callable[[Any], None], *, threads: int) -> Iterator[Submit]:
+def write_behind(done: Callable[[Any], None], *, threads: int, pool: Executor | None = None) -> Iterator[Submit]:
     """A function that runs jobs in the background, and waits while more than `threads` of them are unfinished.
 
     Results reach `done` in the order of submission, in the caller's thread. A job's exception is raised by a later
@@ -49,9 +51,9 @@ def write_behind(done: Callable[[Any], None], *, threads: int) -> Iterator[Submi
         while len(pending) > threads:
             done(pending.popleft().result())
         # Jobs start in order, so whatever this one waits for has started already: no deadlock, even with one thread.
-        pending.append(pool.submit(_after, list(pending), job) if after_all else pool.submit(job))
+        pending.append(workers.submit(_after, list(pending), job) if after_all else workers.submit(job))
 
-    with ThreadPoolExecutor(threads, thread_name_prefix="svgf-write") as pool:
+    with _workers(pool, threads, "svgf-write") as workers:
         try:
             yield submit
         except BaseException:
@@ -61,6 +63,10 @@ def write_behind(done: Callable[[Any], None], *, threads: int) -> Iterator[Submi
             raise
         while pending:
             done(pending.popleft().result())
+
+
+def _workers(pool: Executor | None, threads: int, name: str) -> AbstractContextManager[Executor]:
+    return ThreadPoolExecutor(threads, thread_name_prefix=name) if pool is None else nullcontext(pool)
 
 
 def _after(earlier: list[Future[Any]], job: Callable[[], Any]) -> Any:

@@ -7,7 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    {"atomic", "prints", "remedies"},
+    {"atomic", "memory", "prints", "remedies"},
     {"types"},
     {"limits", "tonemapping", "toml"},
     {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments", "motion"},

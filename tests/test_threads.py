@@ -1,5 +1,6 @@
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -42,6 +43,14 @@ def test_closing_stops_reading():
     count = len(begun)
     time.sleep(0.02)
     assert len(begun) == count < 10
+
+
+def test_one_pool_reads_and_writes_in_the_order_asked_for():
+    done = []
+    with ThreadPoolExecutor(1) as pool, write_behind(lambda _: None, threads=1, pool=pool) as submit:
+        for i in read_ahead(lambda i: (done.append(f"read {i}"), i)[1], range(4), threads=1, pool=pool):
+            submit(lambda i=i: done.append(f"write {i}"))
+    assert done[:6] == ["read 0", "read 1", "write 0", "read 2", "write 1", "read 3"]
 
 
 @pytest.mark.parametrize("threads", [1, 3])

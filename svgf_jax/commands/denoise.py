@@ -112,8 +112,8 @@ def denoise(
         raise SvgfError(f"Got --reference {reference} without --report; references are for the report.")
     results.require_writable((report,), overwrite=overwrite or resume)
 
+    from svgf_jax import memory, streaming
     from svgf_jax import report as reports
-    from svgf_jax import streaming
     from svgf_jax.frames import open_source
     from svgf_jax.outputs import WriteOptions, numbers
     from svgf_jax.references import pair_references
@@ -160,6 +160,7 @@ def denoise(
             terminal.print_json(told | {"method": method, "preset": chosen_preset} | numbers(chosen, config))
         return 0
     watch = None if shown is None else reports.watch(shown)
+    memory.give_back_large()
     with (
         viewer as send,
         _until_interrupted() as interruption,

@@ -58,7 +58,7 @@ def denoise(folder: Path, out: Path, *options: str) -> tuple[float, float]:
     _, status, used = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"{' '.join(command)} failed")
-    return time.monotonic() - began, used.ru_maxrss / 1e6
+    return time.monotonic() - began, used.ru_maxrss * 1024 / 1e9
 
 
 def bench_memory(folder: Path, options: argparse.Namespace) -> list[str]:
