@@ -11,9 +11,9 @@ SECONDS_A_LEVEL = 4.3e-8  # a pixel, signal and a-trous level; all before the fi
 SECONDS_OF_LIGHT = (
     1.1e-7  # a pixel and signal, where changes of the light are followed: by tests/bench/README.md, 1920 x 1080
 )
-BASE_MEMORY = 4.5e8  # bytes: Python, JAX, compilation
-MEMORY = 910.0  # bytes a pixel
-MEMORY_A_SIGNAL = 310.0
+BASE_MEMORY = 3.5e8  # bytes: Python, JAX
+MEMORY = 400.0  # bytes a pixel
+MEMORY_A_SIGNAL = 190.0
 
 
 class Estimate(NamedTuple):
