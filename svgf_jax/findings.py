@@ -106,7 +106,13 @@ def _light(facts: Facts, renderer: str) -> Iterator[Finding]:
     if levels and max(levels) < CONVERGED:
         text = f"hardly any noise: at most {100 * max(levels):.2g} % of the light. Converged, or denoised already."
         yield Finding("warning", "noise", text, remedy("little noise", renderer))
-    if facts.correlation is not None and facts.correlation > CORRELATED:
+    if facts.correlation is not None and facts.correlation > CORRELATED and (lack := undivided(facts)):
+        text = (
+            f"the noise of neighbouring pixels looks correlated ({facts.correlation:.2f}), but that may be texture: without "
+            f"{lack} the two are not told apart."
+        )
+        yield Finding("note", "correlated noise", text, f"If it is noise: {remedy('correlation', renderer)}")
+    elif facts.correlation is not None and facts.correlation > CORRELATED:
         text = (
             f"the noise of neighbouring pixels is correlated ({facts.correlation:.2f}; independent pixels have 0): "
             "a wide pixel filter or a denoiser was at work. The filter will take blotches for detail."
@@ -139,6 +145,15 @@ def _light(facts: Facts, renderer: str) -> Iterator[Finding]:
     if facts.halves.clipped:
         text = f"{facts.halves.clipped} pixels are as bright as half float can be (65504): their light is cut off."
         yield Finding("warning", "half float", text, remedy("half", renderer))
+
+
+def undivided(facts: Facts) -> str:
+    """What lacks for want of which texture that moves counts as noise; "" if nothing does."""
+    if facts.continuity is None:
+        return "two frames in a row"
+    if "motion" in facts.roles.absent:
+        return "motion"
+    return "an albedo" if "albedo" in facts.roles.absent and facts.continuity.still < 0.98 else ""
 
 
 def _guides(facts: Facts, renderer: str) -> Iterator[Finding]:
@@ -208,8 +223,10 @@ def _motion(facts: Facts, renderer: str) -> Iterator[Finding]:
     if not fits:
         judged = any(one.judged for one in residuals.values())
         moves, vectors = judged and _off(facts, None) > NEAR, residuals.keys() != {None}
-        if moves and not vectors:
+        if not vectors and (moves or facts.moved):
+            pixels = f"{facts.moved} pixels show another surface than in the frame before"
             text = f"motion vectors are all 0, though the scene moves: {_off(facts, None):.2g} pixels off."
+            text = text if moves else f"motion vectors are all 0, though something moves: {pixels}."
             yield Finding("warning", "motion", text, remedy("zero motion", renderer))
             return
         still = facts.continuity is not None and facts.continuity.still > 0.98

@@ -78,9 +78,10 @@ class Facts(NamedTuple):
         normals, depth: what they fit.
         halves: hazards of half floats.
         motion: which conventions the motion vectors fit; None without two frames in a row or motion vectors in screen space.
+        moved: surface pixels that show another surface than the frame before, edges left out; in the pair with more.
         warped: how well the motion that the filter gets leads to the frame before; None without two frames in a row.
         continuity: whether the previous frame has what each pixel shows; None without two frames in a row.
-        history: mean history length to expect.
+        history: mean history length to expect; None without two frames in a row, and of other methods than svgf.
         needs: of a run.
     """
 
@@ -106,6 +107,7 @@ class Facts(NamedTuple):
     depth: Fit | None
     halves: Halves
     motion: Verdict | None
+    moved: int
     warped: Residual | None
     continuity: geometry.Continuity | None
     history: float | None
@@ -132,8 +134,12 @@ class _Noise(NamedTuple):
     lights: np.ndarray
 
 
-def inspect_source(source: Source, *, params: Params = Params(), config: Any = Config()) -> Facts:
-    """Find out all of it. Raises SvgfError where not even the frames in question can be read."""
+def inspect_source(source: Source, *, params: Any = Params(), config: Any = Config()) -> Facts:
+    """Find out all of it. Raises SvgfError where not even the frames in question can be read.
+
+    `params` and `config` are those of a run; of other methods than svgf, whose tests of history are their own, no length is told.
+    """
+    tests = params if isinstance(params, Params) else Params()
     scan = scan_files(source)
     known = source.roles.layers.keys()
     source = source._replace(position="position" in known or (source.cameras is not None and "depth" in known))
@@ -144,9 +150,9 @@ def inspect_source(source: Source, *, params: Params = Params(), config: Any = C
     left, top, right, bottom = source.data_window
     width, height = right - left + 1, bottom - top + 1
     screen_left, screen_top, screen_right, screen_bottom = source.display_window
-    matched = [geometry.continuity(a.loaded.frame, b.loaded.frame, params=params) for a, b in steps]
+    matched = [geometry.continuity(a.loaded.frame, b.loaded.frame, params=tests) for a, b in steps]
     share, still = _mean(one.share for one in matched), _mean(one.still for one in matched)
-    most = float(np.max(params.max_history))
+    most = float(np.max(tests.max_history))
     last = read[max(read)]
     told = set(absences(source.roles, source.cameras, source.table).values())  # the roles say it themselves
     return Facts(
@@ -187,9 +193,12 @@ def inspect_source(source: Source, *, params: Params = Params(), config: Any = C
         motion=None
         if declared(source.roles).unit == "world"
         else _motion(steps, (screen_right - screen_left + 1, screen_bottom - screen_top + 1)),
+        moved=max((_moved(a.frame, b.frame) for a, b in steps), default=0),
         warped=_warped(steps),
         continuity=None if share is None or still is None else geometry.Continuity(share, still),
-        history=None if share is None else geometry.expected_length(share, frames=len(scan.there), most=most),
+        history=None
+        if share is None or tests is not params
+        else geometry.expected_length(share, frames=len(scan.there), most=most),
         needs=estimate(scan, pixels=width * height, signals=len(source.roles.signals), config=config),
     )
 
@@ -347,6 +356,17 @@ def _motion(steps: list[tuple[_Read, _Read]], size: tuple[int, int]) -> Verdict 
     if not steps or "motion" not in steps[0][1].planes:
         return None
     return find_convention([Step(a.frame, b.frame, b.inner["motion"], a.inner["motion"]) for a, b in steps], size=size)
+
+
+def _moved(before: Frame, now: Frame) -> int:
+    """Pixels in the middle of 3 x 3 of one surface in both frames, and not of the same: jitter does not bring that about."""
+    depths = [np.asarray(frame.depth, np.float64) for frame in (before, now)]
+    with np.errstate(all="ignore"):
+        turned = (before.normal * now.normal).sum(-1) < noise.ALIKE
+        apart = np.abs(depths[1] - depths[0]) > 0.05 * np.maximum(*depths)
+    differs = (np.asarray(before.object_id) != np.asarray(now.object_id)) | turned | apart
+    count = int((noise.uniform(before) & noise.uniform(now) & differs).sum())
+    return count if count >= geometry.LEAST // 4 else 0
 
 
 def _warped(steps: list[tuple[_Read, _Read]]) -> Residual | None:

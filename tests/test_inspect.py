@@ -82,6 +82,18 @@ def no_vectors(_, planes):
     planes["motion"][:] = 0
 
 
+def move_a_box(number, planes):
+    """A box of 10 x 10 pixels that goes to the right by 4 a frame, in front of what stands still."""
+    box = np.s_[20:30, 10 + 4 * number : 20 + 4 * number]
+    planes["id"][box], planes["depth"][box] = 50, 1
+    planes["normal"][box] = [0, 0, -1]
+
+
+def paint(_, planes):
+    """Texture, and hardly any noise on it."""
+    planes["radiance"][:] = planes["radiance"] / 8 + 0.5 + 0.5 * np.sin(12 * planes["position"].sum(-1, keepdims=True))
+
+
 def halve_motion(_, planes):
     planes["motion"] /= 2
 
@@ -123,6 +135,13 @@ CASES = {
         "correlated noise",
         "correlated",
         'rfilter type="box"',
+    ),
+    "texture": (
+        {"change": paint, "drop": ["albedo"], "speed": 3},
+        {},
+        "correlated noise",
+        "without an albedo the two are not told apart",
+        "box",
     ),
     "one seed": ({"seed": 5}, {}, "seed", "same in every frame", "seed"),
     "one seed of Cycles": (
@@ -167,6 +186,13 @@ CASES = {
         "motion",
         "all 0",
         "Motion Blur",
+    ),
+    "vectors of 0, one box moves": (
+        {"change": move_a_box, "speed": 0, "drop": ["position"]},
+        {},
+        "motion",
+        "though something moves: ",
+        "motion blur",
     ),
     "half the motion": ({"change": halve_motion, "speed": 3}, {}, "motion", "no motion convention fits", "positions"),
     "noisy motion": ({"change": jitter_motion, "speed": 3}, {}, "motion", "no motion convention fits", "positions"),
@@ -217,7 +243,7 @@ def test_what_is_wrong_is_found(tmp_path, case):
     assert topic in found, found
     assert text in found[topic].text
     assert change in found[topic].remedy
-    assert found[topic].level == ("note" if case == "still" else "warning")
+    assert found[topic].level == ("note" if case in ("still", "texture") else "warning")
 
 
 def test_of_a_clean_sequence_nothing_is_to_mend(clean):
@@ -294,6 +320,23 @@ def test_json_has_every_number(clean, capsys):
     assert told["roles"]["layers"]["depth"]["channels"] == ["depth.Z"]
     assert told["findings"][0]["level"] == "note"
     assert told["light"]["radiance"]["fireflies"]["pixels"] < 0.01
+
+
+def test_it_speaks_of_the_run_that_is_meant(clean, tmp_path, capsys):
+    (tmp_path / "p.toml").write_text('preset = "adaptive"\n')
+    told = {}
+    for name, given in {
+        "paper": (),
+        "p.toml": ("--params", tmp_path / "p.toml"),
+        "paper max_history=2.0": ("--set", "max_history=2.0"),
+        "gaussian": ("--method", "gaussian"),
+    }.items():
+        told[name] = json.loads(run(capsys, "inspect", clean, "--json", *given)[1])
+        assert told[name]["preset"] == name
+    needs = {name: one["needs"]["seconds"] for name, one in told.items()}
+    assert needs["p.toml"] > needs["paper"]
+    assert told["paper max_history=2.0"]["history"] < told["paper"]["history"]
+    assert told["gaussian"]["history"] is None
 
 
 def test_text_from_files_is_never_markup(tmp_path, capsys):

@@ -18,16 +18,6 @@ from svgf_jax.types import SvgfError
 if TYPE_CHECKING:
     from svgf_jax.streaming import Summary
 
-Method = Literal[
-    "svgf",
-    "games202",
-    "games202-atrous",
-    "accumulate",
-    "joint-bilateral",
-    "joint-bilateral-atrous",
-    "bilateral",
-    "gaussian",
-]
 Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab"]
 HEADERS = 200  # of frames that are looked at before a run starts: a fifth of a second
 FILTER, OUTPUT, RUN = (Group(name, sort_key=i) for i, name in enumerate(["Filter", "Output", "Run"], 1))
@@ -42,7 +32,7 @@ def denoise(
     missing: Annotated[Literal["error", "hold", "reset"], Parameter(group=INPUT)] = "error",
     warmup: Annotated[int | None, Parameter(metavar="FRAMES", group=INPUT)] = None,
     reading: Reading = Reading(),
-    method: Annotated[Method, Parameter(group=FILTER)] = "svgf",
+    method: Annotated[settings.Method, Parameter(group=FILTER)] = "svgf",
     preset: Annotated[str | None, Parameter(metavar="NAME", group=FILTER)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=FILTER)] = None,
     set_: Annotated[tuple[str, ...], Repeated, Parameter(name="--set", metavar="NAME=VALUE", group=FILTER)] = (),

@@ -1,19 +1,20 @@
 """`svgf-jax inspect`."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
 from svgf_jax.commands import settings, terminal
-from svgf_jax.commands.settings import INPUT, Flag, Reading
+from svgf_jax.commands.settings import INPUT, Flag, Reading, Repeated
 
 if TYPE_CHECKING:
     from svgf_jax.findings import Finding
     from svgf_jax.geometry import Fit
     from svgf_jax.inspection import Facts
 
-OUTPUT = Group("Output", sort_key=1)
+FILTER, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["Filter", "Output"], 1))
 CONVENTIONS = 4  # motion conventions that are shown besides those that fit
 Rows = list[tuple[str, str]]
 
@@ -25,7 +26,10 @@ def inspect(
     frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
     missing: Annotated[Literal["error", "hold", "reset"], Parameter(group=INPUT)] = "error",
     reading: Reading = Reading(),
-    preset: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None,
+    method: Annotated[settings.Method, Parameter(group=FILTER)] = "svgf",
+    preset: Annotated[str | None, Parameter(metavar="NAME", group=FILTER)] = None,
+    params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=FILTER)] = None,
+    set_: Annotated[tuple[str, ...], Repeated, Parameter(name="--set", metavar="NAME=VALUE", group=FILTER)] = (),
     json: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
     strict: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
 ) -> int:
@@ -37,11 +41,14 @@ def inspect(
         input_: A folder, a pattern (frame_####.exr, frame_%04d.exr, frame_$F4.exr) or one file.
         frames: Only these: 1-100, 1-100x2 or 1,3,5-9.
         missing: As for denoise: hold and reset allow missing frames.
-        preset: The preset of the run, for its history and time; `svgf-jax params list` shows them.
+        method: What would filter, for the history and needs of a run; as for denoise.
+        preset: The same: a preset of svgf; `svgf-jax params list` shows them.
+        params: The same: parameters from a TOML file.
+        set_: The same: one parameter, or one value per a-trous level. Repeatable.
         json: Print everything as JSON to the standard output instead.
         strict: Exit with 2 if there is anything to mend, too.
     """
-    _, params, config = settings.choose(preset, None, ())
+    record, chosen, config = settings.choose_method(method, preset, params, set_)
     opened = reading.options()
 
     from svgf_jax.findings import judge, verdict
@@ -49,18 +56,20 @@ def inspect(
     from svgf_jax.inspection import inspect_source
 
     source = open_source(input_, frames=frames, missing="reset" if missing == "error" else missing, **opened)
-    facts = inspect_source(source, params=params, config=config)
+    facts = inspect_source(source, params=chosen, config=config)
     findings = judge(facts, gaps_allowed=missing != "error")
     if json:
-        terminal.print_json(_record(facts) | {"findings": findings, "verdict": verdict(findings)})
+        told = {"method": method, "preset": record} | _record(facts)
+        terminal.print_json(told | {"findings": findings, "verdict": verdict(findings)})
     else:
-        _print(facts, findings, verdict(findings))
+        kind = "method " if method != "svgf" else "preset " if params is None else ""
+        _print(facts, findings, verdict(findings), kind + record)
     bad = ("error", "warning") if strict else ("error",)
     return 2 if any(one.level in bad for one in findings) else 0
 
 
-def _print(facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str) -> None:
-    """Sections of labels and texts, then what to mend, then the verdict. Nothing is taken for markup."""
+def _print(facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str, run: str) -> None:
+    """Sections of labels and texts, then what to mend, then the verdict. Nothing is taken for markup. `run`: what would filter."""
     from rich.console import Console
     from rich.padding import Padding
     from rich.table import Table
@@ -71,7 +80,7 @@ def _print(facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str) -> 
 
     console = Console(highlight=False)
     console.print(shown(facts.name, style="bold"))
-    sections = [(title, rows) for title, rows in _sections(facts) if rows]
+    sections = [(title, rows) for title, rows in _sections(facts, run) if rows]
     width = max(len(label) for _, rows in sections for label, _ in rows)
     for title, rows in sections:
         grid = Table.grid(padding=(0, 2, 0, 0))
@@ -105,7 +114,7 @@ def _print(facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str) -> 
     console.print(shown(conclusion, style=style))
 
 
-def _sections(facts: "Facts") -> Iterator[tuple[str, Rows]]:
+def _sections(facts: "Facts", run: str) -> Iterator[tuple[str, Rows]]:
     yield "Files", list(_files(facts))
     yield "Channels", list(_channels(facts))
     yield f"Light (frame{'s' * (len(facts.read) > 1)} {', '.join(map(str, facts.read))})", list(_light(facts))
@@ -114,8 +123,8 @@ def _sections(facts: "Facts") -> Iterator[tuple[str, Rows]]:
     seconds = facts.needs.seconds
     whole = terminal.duration(seconds * len(facts.scan.there))
     time = f"about {whole}, {seconds:.2g} s a frame, on two cores, after compiling"
-    needs = (terminal.size(amount) for amount in (facts.needs.memory, facts.needs.disk))
-    yield "A run", [("time", time), *zip(("memory", "disk"), (f"at most about {need}" for need in needs), strict=True)]
+    needs = [(name, f"at most about {terminal.size(getattr(facts.needs, name))}") for name in ("memory", "disk")]
+    yield "A run", [("filter", run), ("time", time), *needs]
 
 
 def _files(facts: "Facts") -> Iterator[tuple[str, str]]:
@@ -146,7 +155,7 @@ def _channels(facts: "Facts") -> Iterator[tuple[str, str]]:
 
 
 def _light(facts: "Facts") -> Iterator[tuple[str, str]]:
-    from svgf_jax.findings import CORRELATED, REPEATED
+    from svgf_jax.findings import CORRELATED, REPEATED, undivided
 
     for name, light in facts.light.items():
         level = "hardly any light" if light.noise is None else f"noise {100 * light.noise:.3g} % of the light"
@@ -159,7 +168,8 @@ def _light(facts: "Facts") -> Iterator[tuple[str, str]]:
         yield name, f"{level}; {flies}"
     if facts.psnr is not None:
         yield "picture", f"about {facts.psnr:.1f} dB (PSNR that svgf-jax compare would show, by the noise alone)"
-    yield "neighbours", _correlation(facts.correlation, CORRELATED, "independent noise", "correlated noise")
+    high = "correlated noise, or texture" if undivided(facts) else "correlated noise"
+    yield "neighbours", _correlation(facts.correlation, CORRELATED, "independent noise", high)
     yield "frames", _correlation(facts.repeated, REPEATED, "independent noise", "the same noise again")
     broken = [
         f"{role} {', '.join(f'{count} {kind}' for kind, count in one._asdict().items() if count)}"
@@ -221,14 +231,10 @@ def _motion(facts: "Facts") -> Iterator[tuple[str, str]]:
     if facts.warped is not None and facts.warped.judged:
         whose = "as read" if "motion" in facts.roles.layers else "by cameras"
         yield whose, f"{facts.warped.pixels:.3g} pixels off (by {', '.join(facts.warped.guides)})"
-    if facts.continuity is not None and facts.history is not None:
-        yield (
-            "history",
-            (
-                f"{100 * facts.continuity.share:.3g} % of the surfaces are found in the frame before: "
-                f"{facts.history:.1f} frames long on average over the sequence"
-            ),
-        )
+    if facts.continuity is not None:
+        found = f"{100 * facts.continuity.share:.3g} % of the surfaces are found in the frame before"
+        long = "" if facts.history is None else f": {facts.history:.1f} frames long on average over the sequence"
+        yield "history", found + long
 
 
 def _sentence(text: str) -> str:

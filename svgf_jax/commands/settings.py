@@ -45,6 +45,16 @@ def choose_method(
     return " ".join([method, *(f"{key}={text}" for key, text in texts.items())]), *override_method(method, values)
 
 
+Method = Literal[
+    "svgf",
+    "games202",
+    "games202-atrous",
+    "accumulate",
+    "joint-bilateral",
+    "joint-bilateral-atrous",
+    "bilateral",
+    "gaussian",
+]
 INPUT = Group("Input", sort_key=0)
 Flag: Parameter = Parameter(negative=(), show_default=False)
 Repeated: Parameter = Parameter(negative=(), consume_multiple=False, show_default=False)
