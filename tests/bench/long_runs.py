@@ -1,6 +1,6 @@
 """Memory, overlap and start of `svgf-jax denoise`, run as a person runs it, on files of a few frames that are linked many times.
 
-    python tests/bench/long_runs.py [memory] [overlap] [start] [endless] [drift] [restarts] [--rounds 3] [--minutes 60]
+    python tests/bench/long_runs.py [memory] [overlap] [start] [endless] [drift] [same] [restarts] [--rounds 3] [--minutes 60]
 
 memory: peak resident set at 1920x1080 and 3840x2160 with two signals, for ten frames and (at 1920x1080) for --long of them.
 overlap: wall time of a run at 1920x1080, ZIP, beside the larger of reading and writing alone, and filtering alone.
@@ -8,6 +8,7 @@ start: seconds from the command to the first written frame at 480x270.
 endless: resident memory, open files and threads over --endless frames of 240x135 (1.6 GB of disk; Linux).
 drift: float32 against float64 over --endless frames on arrays: the variance from the accumulated moments, by how much larger
 the mean is than the deviation; and the whole filter with alpha = 0 and a history without end.
+same: run after run, with 1 to 4 threads, checkpoints at other frames, and over two devices: whether the bits are the same.
 restarts: SIGINT, SIGTERM and kill -9 at random moments of runs that are resumed until they are done, for --minutes (see faults.py).
 
 Prints Markdown tables.
@@ -234,6 +235,42 @@ def bench_drift(folder: Path, options: argparse.Namespace) -> list[str]:
     return lines
 
 
+def bench_same(folder: Path, options: argparse.Namespace) -> list[str]:
+    """Run after run in one process each, with the real filter."""
+    from struck_runs import FRAMES, write_shot
+
+    shot = write_shot(folder / "shot")
+    runs = [{"again": i} for i in range(3)] + [{"threads": n} for n in (1, 2, 3, 4)]
+    runs += [{"checkpoint_every": n} for n in (1, 5, 24)] + [{"devices": 2}]
+    images = {}
+    for k, chosen in enumerate(runs):
+        given = {"preset": "adaptive", **{name: value for name, value in chosen.items() if name != "again"}}
+        code = (
+            "import svgf_jax as sj; from svgf_jax import streaming; from svgf_jax.outputs import WriteOptions\n"
+            f"params, config = sj.preset('adaptive'); streaming.run(sj.open_source({str(shot)!r}), {str(folder / str(k))!r},"
+            f" params=params, config=config, options=WriteOptions(full_float=True, diagnostics=True), **{given})"
+        )
+        subprocess.run([sys.executable, "-c", code], check=True)
+        images[k] = [exr.read(path) for path in sorted((folder / str(k)).glob("*.exr"))]
+    lines = [
+        f"| {FRAMES} frames, `adaptive`, 32-bit | the first run's bits | else largest difference of a pixel |",
+        "|---|---|---|",
+    ]
+    for k, chosen in enumerate(runs[1:], 1):
+        same = all(
+            (folder / str(k) / path.name).read_bytes() == path.read_bytes() for path in (folder / "0").glob("*.exr")
+        )
+        pairs = zip(images[k], images[0], strict=True)
+        largest = max(
+            float((np.abs(a.channels[c] - b.channels[c]) / (np.abs(b.channels[c]) + 1e-3 * b.channels[c].max())).max())
+            for a, b in pairs
+            for c in "RGB"
+        )
+        name = ", ".join(f"{key} {value}" for key, value in chosen.items())
+        lines.append(f"| {name} | {'yes' if same else 'no'} | {'' if same else f'{largest:.1e}'} |")
+    return lines
+
+
 def bench_restarts(folder: Path, options: argparse.Namespace) -> list[str]:
     import random
 
@@ -262,6 +299,7 @@ BENCHES = {
     "start": bench_start,
     "endless": bench_endless,
     "drift": bench_drift,
+    "same": bench_same,
     "restarts": bench_restarts,
 }
 
