@@ -174,5 +174,6 @@ def _write_atomically(path: str | Path, write: Callable[[str], object], *failure
             write(str(temporary))
     except (OSError, *failures) as error:
         raise SvgfError(
-            f"Could not write {path}: {error}. Check that the folder exists, is writable and is not full."
+            f"Could not write {path}: {getattr(error, 'strerror', None) or error}. "
+            "Check that the folder exists, is writable and is not full."
         ) from error
