@@ -1,6 +1,7 @@
 """Strict by default: dtype and rank promotion are errors, float64 is on (tests choose their dtypes themselves)."""
 
 import os
+import runpy
 from pathlib import Path
 
 import jax
@@ -14,6 +15,8 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.devices()
 QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
+
+runpy.run_path(str(Path(__file__).parent / "offline" / "sitecustomize.py"))  # nor do tests ask the network
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 

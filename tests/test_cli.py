@@ -17,6 +17,7 @@ from svgf_jax.commands import terminal
 from svgf_jax.types import Rejected
 
 ROOT = Path(__file__).parents[1]
+SEARCHED = f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'offline'}"  # without a network
 PRELUDE = """
 import atexit, resource, sys
 def tell():
@@ -32,14 +33,14 @@ main()
 
 def command(*arguments, cwd=None, under=()):
     """Run `svgf-jax` in a process of its own, `under` another command."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "100"}
+    environment = os.environ | {"PYTHONPATH": SEARCHED, "COLUMNS": "100"}
     call = [*under, sys.executable, "-m", "svgf_jax", *map(str, arguments)]
     return subprocess.run(call, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120)
 
 
 def observed(*arguments, cwd=None):
     """(exit code, standard error, processor seconds, heavy modules imported) of a command."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": SEARCHED}
     call = [sys.executable, "-c", PRELUDE, *map(str, arguments)]
     done = subprocess.run(call, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120)
     error, _, told = done.stderr.rpartition("TELL ")
@@ -181,7 +182,7 @@ def test_a_terminal_gets_a_progress_bar(shots, tmp_path):
     pty = pytest.importorskip("pty")
     reading, writing = pty.openpty()
     call = [sys.executable, "-m", "svgf_jax", "denoise", "good", "-o", str(tmp_path / "out"), "--set", "levels=1"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "120"}
+    environment = os.environ | {"PYTHONPATH": SEARCHED, "TERM": "xterm", "COLUMNS": "120"}
     process = subprocess.Popen(call, cwd=shots, env=environment, stderr=writing, stdout=subprocess.DEVNULL)
     os.close(writing)
     shown = b""
@@ -236,7 +237,7 @@ def long(tmp_path_factory):
 def test_an_interrupted_command_resumes_to_the_same_bits(long, number):
     out = long / f"out{number}"
     call = [sys.executable, "-m", "svgf_jax", *LONG, out.name]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": SEARCHED}
     process = subprocess.Popen(call, cwd=long, env=environment, stderr=subprocess.PIPE, text=True)
     while "frame 2:" not in process.stderr.readline():
         assert process.poll() is None
@@ -275,7 +276,7 @@ def test_killed_at_any_moment_resumes_to_the_same_bits(tmp_path):
     """kill -9 at random moments. SVGF_KILLS says how often, SVGF_SEED which."""
     rng = np.random.default_rng(int(os.environ.get("SVGF_SEED", "0")))
     write_shot(tmp_path / "in", range(1, 61))
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": SEARCHED}
 
     def start(out):
         call = [sys.executable, "-c", KILLED, str(tmp_path / "in"), str(tmp_path / out), str(ROOT / "tests")]
