@@ -29,7 +29,8 @@ def modulate(illumination: Array, frame: Frame, *, albedo_floor: Array | float =
             reflected = (remodulate(c, a, albedo_floor=albedo_floor) for c, a in zip(signal, albedo, strict=True))
             passed = (jnp.where(surface, r, own) for r, own in zip(reflected, radiance, strict=True))
             total = tuple(t + c for t, c in zip(total, passed, strict=True))
-        return total
+        # A neighbour's light may be brighter than this albedo bears.
+        return tuple(jnp.minimum(t, float(jnp.finfo(t.dtype).max)) for t in total)
 
     image = in_strips(
         add_up,

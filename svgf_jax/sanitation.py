@@ -14,9 +14,10 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
     """Make every number of a frame finite.
 
     Radiance: non-finite or negative components become 0. Emission: non-finite ones become 0, negative ones stay. A non-finite
-    normal, depth, albedo or position: no surface. A non-finite motion or prev_depth: no history. Guides read 0 where there is no
-    surface, the albedo 1. A measured variance that is not finite or negative becomes -1, unknown. A non-finite reflected
-    motion or depth: the reflection moves with the surface.
+    normal, depth, albedo or position, or a depth beyond 2e17 (in float32): no surface. A normal that is not of unit length by more
+    than 1 % is brought to it; one of zeros stays. A non-finite motion or prev_depth: no history. Guides read 0 where there is no
+    surface, the albedo 1. A measured variance that is not finite or negative becomes -1, unknown. A non-finite reflected motion or
+    depth: the reflection moves with the surface.
 
     Args:
         frame: one frame; shapes as in `Frame`.
@@ -28,20 +29,19 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
     radiance_positive = ~(frame.radiance < 0.0)
     was_surface = frame.object_id != -1
     guided = (
-        jnp.isfinite(frame.normal).all(axis=-1)
-        & jnp.isfinite(frame.depth)
-        & jnp.isfinite(frame.albedo).all(axis=(0, 3))
+        jnp.isfinite(frame.normal).all(axis=-1) & _usable(frame.depth) & jnp.isfinite(frame.albedo).all(axis=(0, 3))
     )
     if frame.position is not None:
         guided &= jnp.isfinite(frame.position).all(axis=-1)
-    traced = jnp.isfinite(frame.motion).all(axis=-1) & jnp.isfinite(frame.prev_depth)
+    traced = jnp.isfinite(frame.motion).all(axis=-1) & _usable(frame.prev_depth)
     surface = was_surface & guided
+    normal, unusual = _to_unit_length(jnp.where(surface[..., None], frame.normal, 0.0))
 
     repaired = Frame(
         radiance=jnp.where(radiance_finite & radiance_positive, frame.radiance, 0.0),
         albedo=jnp.where(surface[None, :, :, None], frame.albedo, 1.0),
         emission=jnp.where(emission_finite, frame.emission, 0.0),
-        normal=jnp.where(surface[..., None], frame.normal, 0.0),
+        normal=normal,
         depth=jnp.where(surface, frame.depth, 0.0),
         prev_depth=jnp.where(surface & traced, frame.prev_depth, 0.0),
         motion=jnp.where((surface & traced)[..., None], frame.motion, _NOWHERE),
@@ -56,8 +56,24 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
         emission=add_up(~emission_finite.all(axis=-1)),
         surface=add_up(was_surface & ~guided),
         motion=add_up(surface & ~traced),
+        normal=add_up(unusual),
     )
     return repaired, rejected
+
+
+def _usable(depth: Array) -> Array:
+    """Depths are multiplied by each other, in the derivatives of their weights."""
+    return jnp.abs(depth) < float(jnp.finfo(depth.dtype).max) ** 0.5 / 2**6
+
+
+def _to_unit_length(normal: Array) -> tuple[Array, Array]:
+    """Longer ones would weigh more than all else together: 1.1 ** 128 = 200000. A unit normal stays as it is, to the bit."""
+    largest = jnp.abs(normal).max(axis=-1)
+    some = largest > 1e-18
+    scaled = normal / jnp.where(some, largest, 1.0)[..., None]  # squares neither overflow nor vanish
+    square = jnp.where(some, (scaled * scaled).sum(axis=-1), 1.0)
+    unusual = some & (jnp.abs(square * largest * largest - 1.0) > 0.02)
+    return jnp.where(unusual[..., None], scaled / jnp.sqrt(square)[..., None], normal), unusual
 
 
 def _reflections(frame: Frame, surface: Array) -> dict[str, Array]:

@@ -119,6 +119,7 @@ class Rejected(NamedTuple):
         emission: pixels with a non-finite emission component (set to 0).
         surface: surface pixels dropped for a non-finite normal, depth or albedo.
         motion: surface pixels without history for a non-finite motion or prev_depth.
+        normal: surface pixels with a normal not of unit length (brought to it).
     """
 
     radiance: Array
@@ -126,6 +127,7 @@ class Rejected(NamedTuple):
     emission: Array
     surface: Array
     motion: Array
+    normal: Array
 
 
 class Output(NamedTuple):

@@ -82,7 +82,7 @@ def sanitise(frame):
     frame = {name: np.array(value, dtype=int if name == "object_id" else float) for name, value in frame.items()}
     signals, height, width, _ = frame["radiance"].shape
     usable_motion = np.zeros((height, width), dtype=bool)
-    rejected = dict.fromkeys(("radiance", "negative", "emission", "surface", "motion"), 0)
+    rejected = dict.fromkeys(("radiance", "negative", "emission", "surface", "motion", "normal"), 0)
     for y in range(height):
         for x in range(width):
             radiance = frame["radiance"][:, y, x].reshape(-1).tolist()

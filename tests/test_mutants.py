@@ -338,7 +338,7 @@ MUTANTS = {
         "test_sanitise",
     ),
     "NaN albedo passes as valid": mutant(
-        "sanitation", "        & jnp.isfinite(frame.albedo).all(axis=(0, 3))\n", "", "test_sanitise"
+        "sanitation", " & jnp.isfinite(frame.albedo).all(axis=(0, 3))", "", "test_sanitise"
     ),
     "emission forgotten": mutant("modulation", "total = emission", "total = tuple(0.0 * e for e in emission)", "test_step"),
     "background lost": mutant(
