@@ -19,7 +19,9 @@ def replacing(path: str | os.PathLike[str], *, unique: bool = True) -> Iterator[
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp" if unique else f".{path.name}.tmp")
     try:
-        temporary.touch()
+        if not unique:
+            temporary.unlink(missing_ok=True)
+        temporary.touch(exist_ok=False)  # follows no link that somebody put there
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())

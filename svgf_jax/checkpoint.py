@@ -83,6 +83,9 @@ def _held(state: Path, *, shared: bool = False) -> Iterator[Callable[[], None]]:
 
 def _locked(path: Path, *, shared: bool) -> TextIO:
     """The lock file, open and locked, its folder made. A run that failed may remove it in between: then again."""
+    for kept in (path.parent, path, path.parent / "frames.jsonl"):
+        if kept.is_symlink():
+            raise SvgfError(f"{kept} is a symbolic link; nothing is written through it. Remove it.")
     for _ in range(10):
         path.parent.mkdir(parents=True, exist_ok=True)
         file = open(path, "a+")  # noqa: SIM115 (open for as long as the lock is held)
@@ -173,7 +176,7 @@ def load_checkpoint(state: Path, identity: Identity) -> Checkpoint | None:
             raise ValueError("incomplete")
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, zipfile.BadZipFile) as error:
         raise _unusable(path, error) from error
     check_same(state, saved, identity, used=next_index)
     return Checkpoint(next_index, history)

@@ -73,8 +73,8 @@ class Legend(NamedTuple):
 
 
 def escape(text: object) -> str:
-    """Text for HTML, attributes included."""
-    return html.escape(str(text))
+    """Text for HTML, attributes included; bytes of file names that are no text are spelt out."""
+    return html.escape(str(text)).encode("utf-8", "backslashreplace").decode()
 
 
 def document(title: str, sections: Iterable[str]) -> str:

@@ -32,12 +32,13 @@ REPAIRS = {
 """What became of the pixels that a frame's report counts, by its reason."""
 
 
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # but line ends and tabs
+# But line ends and tabs; what turns the direction of writing or is invisible; bytes of file names that are no text.
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
 
 
 def visible(text: str) -> str:
     """`text` with control characters spelt out: names from files shall not steer the terminal."""
-    return _CONTROL.sub(lambda found: f"\\x{ord(found.group()):02x}", text)
+    return _CONTROL.sub(lambda found: ascii(found.group())[1:-1], text)
 
 
 def tell(text: str) -> None:
