@@ -12,11 +12,10 @@ from rooms import SIZE, camera, write_room
 from test_dry_run import run
 
 from svgf_jax import exr, sample
-from svgf_jax.commands.inspect import _light, _sentence
-from svgf_jax.findings import Finding, judge, verdict
+from svgf_jax.commands.inspect import _light
+from svgf_jax.findings import judge, verdict
 from svgf_jax.frames import open_source
 from svgf_jax.inspection import inspect_source
-from svgf_jax.remedies import REMEDIES, remedy
 
 
 def inspected(folder, **options):
@@ -386,30 +385,6 @@ def test_it_needs_no_jax(clean):
     code += "print(sorted({'jax', 'jaxlib'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code, str(clean)], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
-
-
-def test_every_remedy_says_something_to_do():
-    for topic, by_renderer in REMEDIES.items():
-        assert "" in by_renderer, topic
-        for renderer, text in by_renderer.items():
-            assert re.fullmatch(r"\S.*[.)]", text), (topic, renderer)
-            assert remedy(topic, renderer) == text
-
-
-def test_a_sentence_begins_with_a_capital_letter_but_a_path_does_not():
-    for text in ("gaps/frame_0001.exr: cut off", "my shots/a.exr: cut off", "room.0001.exr: cut off"):
-        assert _sentence(text) == text
-    assert _sentence("frames 3 are missing.") == "Frames 3 are missing."
-    assert _sentence("no albedo: taken as 1.") == "No albedo: taken as 1."
-    assert _sentence("fast: 1/2") == "Fast: 1/2"
-
-
-def test_a_verdict_counts():
-    error, warning, note = (Finding(level, "", "", "") for level in ("error", "warning", "note"))
-    assert verdict((note,)) == "ready"
-    assert verdict((warning, note)) == "can run, 1 thing to mend"
-    assert verdict((error, warning, warning)) == "cannot run: 1 error, 2 things to mend"
-    assert verdict((error, error)) == "cannot run: 2 errors"
 
 
 @pytest.mark.parametrize(("name", "motion"), [("cycles/multipart", "pixel y-up to-previous"), ("mitsuba", None)])

@@ -170,6 +170,33 @@ def test_the_table_of_the_tuner_is_no_error_elsewhere(chosen):
     assert chosen("[tune]\nmax-steps = 3\n")["method"] == "svgf"
 
 
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        (["denoise", "x", "--preset"], {"paper", "adaptive"}),
+        (["inspect", "x", "--renderer"], {"auto", "native", "cycles"}),
+        (["ablate", str(ROOT / "tests" / "data" / "cycles" / "layers"), "--layer"], {"Other", "ViewLayer"}),
+        (["denoise", "nowhere", "--layer"], set()),
+        (["params", "show"], {"paper", "gaussian"}),
+    ],
+)
+def test_values_are_completed(words, wanted, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["__complete", *words, ""])
+    told = set(capsys.readouterr().out.split())
+    assert told >= wanted
+    assert wanted or told == {"begin"}
+
+
+def test_the_tuner_is_completed_too(capsys):
+    with pytest.raises(SystemExit):
+        tune(["--completion", "bash"])
+    assert "--tangent-batch" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        tune(["__complete", "noisy", "--preset", "pa"])
+    assert "paper" in capsys.readouterr().out.split()
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_a_shell_gets_its_completion(shell, capsys):
     with pytest.raises(SystemExit) as end:

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 from cyclopts import App, CycloptsError, Group, Parameter
 
@@ -19,18 +19,24 @@ app: App = App(
     help_format="plaintext",
 )
 app.default(command)
+PROJECT = Group("Project", sort_key=9)
 
 
 @app.meta.default
 def launch(
     *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
-    config: Annotated[str, Parameter(metavar="FILE", group=Group("Project", sort_key=9))] = "auto",
+    config: Annotated[str, Parameter(metavar="FILE", group=PROJECT)] = "auto",
+    completion: Annotated[Literal["bash", "zsh", "fish", "powershell"] | None, Parameter(group=PROJECT)] = None,
 ) -> Any:
     """Run with the project's file behind the command line.
 
     Args:
         config: Flags of this project, its tables [tune] and [all]; auto takes the nearest svgf-jax.toml, none ignores it.
+        completion: Print a script that completes this command in a shell, and do nothing else.
     """
+    if completion is not None:
+        print(app.generate_completion(shell=completion), end="")
+        return 0
     use_project(app, config, commands=svgf_jax, table="tune")
     try:
         return app(tokens, exit_on_error=False, print_error=False, result_action="return_value")

@@ -11,6 +11,7 @@ from cyclopts import Group, Parameter
 
 from svgf_jax import SvgfError
 from svgf_jax.commands import settings, terminal
+from svgf_jax.commands.completing import PRESET
 from svgf_jax.commands.settings import INPUT, Flag, Reading
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def command(
     frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
     validate_frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
     reading: Reading = Reading(),
-    preset: Annotated[str | None, Parameter(metavar="NAME", group=WHAT)] = None,
+    preset: Annotated[str | None, PRESET, Parameter(metavar="NAME", group=WHAT)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=WHAT)] = None,
     set_: Annotated[
         tuple[str, ...], Parameter(name="--set", metavar="NAME=VALUE", negative=(), show_default=False, group=WHAT)

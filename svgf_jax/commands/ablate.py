@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Group, Parameter
 
 from svgf_jax.commands import results, settings, terminal
+from svgf_jax.commands.completing import PRESET
 from svgf_jax.commands.settings import INPUT, Flag, Reading, Repeated
 from svgf_jax.types import SvgfError
 
@@ -32,7 +33,7 @@ def ablate(
     reference: Annotated[str, Parameter(metavar="REF", group=INPUT)],
     frames: Annotated[str | None, Parameter(metavar="RANGE", group=INPUT)] = None,
     reading: Reading = Reading(),
-    preset: Annotated[str | None, Parameter(metavar="NAME", group=BASE)] = None,
+    preset: Annotated[str | None, PRESET, Parameter(metavar="NAME", group=BASE)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=BASE)] = None,
     set_: Annotated[tuple[str, ...], Repeated, Parameter(name="--set", metavar="NAME=VALUE", group=BASE)] = (),
     only: Annotated[str | None, Parameter(metavar="NAMES", group=BASE)] = None,

@@ -7,12 +7,13 @@ from cyclopts import Parameter
 
 from svgf_jax.commands import settings, terminal
 from svgf_jax.commands.compare import print_scores
+from svgf_jax.commands.completing import PRESET
 
 
 def demo(
     *,
     out: Annotated[Path, Parameter(name=["--out", "-o"], metavar="FOLDER")] = Path("svgf-demo"),
-    preset: Annotated[str, Parameter(metavar="NAME")] = "paper",
+    preset: Annotated[str, PRESET, Parameter(metavar="NAME")] = "paper",
     overwrite: Annotated[bool, Parameter(negative=(), show_default=False)] = False,
 ) -> None:
     """Denoise the bundled ten-frame sample, measure it, and show it beside its reference.

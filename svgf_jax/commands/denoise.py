@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Group, Parameter
 
 from svgf_jax.commands import results, settings, terminal
+from svgf_jax.commands.completing import PRESET
 from svgf_jax.commands.rehearsal import describe_input, rehearse
 from svgf_jax.commands.settings import INPUT, Flag, Reading, Repeated
 from svgf_jax.types import SvgfError
@@ -33,7 +34,7 @@ def denoise(
     warmup: Annotated[int | None, Parameter(metavar="FRAMES", group=INPUT)] = None,
     reading: Reading = Reading(),
     method: Annotated[settings.Method, Parameter(group=FILTER)] = "svgf",
-    preset: Annotated[str | None, Parameter(metavar="NAME", group=FILTER)] = None,
+    preset: Annotated[str | None, PRESET, Parameter(metavar="NAME", group=FILTER)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=FILTER)] = None,
     set_: Annotated[tuple[str, ...], Repeated, Parameter(name="--set", metavar="NAME=VALUE", group=FILTER)] = (),
     taa: Annotated[bool, Flag, Parameter(group=FILTER)] = False,

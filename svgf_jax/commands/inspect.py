@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Group, Parameter
 
 from svgf_jax.commands import settings, terminal
+from svgf_jax.commands.completing import PRESET
 from svgf_jax.commands.settings import INPUT, Flag, Reading, Repeated
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def inspect(
     missing: Annotated[Literal["error", "hold", "reset"], Parameter(group=INPUT)] = "error",
     reading: Reading = Reading(),
     method: Annotated[settings.Method, Parameter(group=FILTER)] = "svgf",
-    preset: Annotated[str | None, Parameter(metavar="NAME", group=FILTER)] = None,
+    preset: Annotated[str | None, PRESET, Parameter(metavar="NAME", group=FILTER)] = None,
     params: Annotated[Path | None, Parameter(metavar="FILE.toml", group=FILTER)] = None,
     set_: Annotated[tuple[str, ...], Repeated, Parameter(name="--set", metavar="NAME=VALUE", group=FILTER)] = (),
     json: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,

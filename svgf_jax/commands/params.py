@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from svgf_jax.commands import settings
+from svgf_jax.commands.completing import ANY, LISTED
 from svgf_jax.methods import METHODS, Games202Params, MethodConfig
 from svgf_jax.types import Config, Params, SvgfError
 
@@ -15,10 +16,10 @@ Set = Annotated[
     tuple[str, ...],
     Parameter(name="--set", metavar="NAME=VALUE", negative=(), consume_multiple=False, show_default=False),
 ]
-Name = Annotated[str, Parameter(name="PRESET|METHOD|FILE.toml")]
+Name = Annotated[str, ANY, Parameter(name="PRESET|METHOD|FILE.toml")]
 
 
-def list_(kind: Annotated[str, Parameter(name="presets|methods|METHOD")] = "presets", /) -> None:
+def list_(kind: Annotated[str, LISTED, Parameter(name="presets|methods|METHOD")] = "presets", /) -> None:
     """List the presets with their parameters, the methods of `denoise --method`, or one method's parameters.
 
     Args:

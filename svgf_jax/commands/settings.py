@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
+from svgf_jax.commands.completing import LAYER, RENDERER
 from svgf_jax.methods import METHOD_CHOICES, MethodConfig, check_settable, override_method
 from svgf_jax.types import CHOICES, Config, Params, SvgfError, choices_of
 
@@ -79,8 +80,8 @@ class Reading:
     channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = ()
     file: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=PATTERN", group=INPUT)] = ()
     cameras: Annotated[str, Parameter(metavar="FILE", group=INPUT)] = "auto"
-    renderer: Annotated[str, Parameter(metavar="NAME", group=INPUT)] = "auto"
-    layer: Annotated[str | None, Parameter(metavar="NAME", group=INPUT)] = None
+    renderer: Annotated[str, RENDERER, Parameter(metavar="NAME", group=INPUT)] = "auto"
+    layer: Annotated[str | None, LAYER, Parameter(metavar="NAME", group=INPUT)] = None
     motion: Annotated[str | None, Parameter(metavar="WORDS", group=INPUT)] = None
 
     def options(self) -> dict[str, Any]:
