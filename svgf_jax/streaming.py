@@ -175,6 +175,7 @@ def run(
         if start is not None:
             read = partial(_read, source, plan)
             write = partial(_write, source, plan, options, provenance, on_output, still_locked)
+            save = partial(_save, plan, still_locked)
             workers = threads if threads == 1 else 2 * threads  # one writes a frame before it reads the next
             with (
                 ThreadPoolExecutor(workers, thread_name_prefix="svgf-files") as pool,
@@ -184,8 +185,11 @@ def run(
                 ) as loaded,
             ):
                 keep = on_output is not None
-                end = _filter(plan, start, loaded, filters, write, submit, stop, checkpoint_every, keep_frames=keep)
+                end = _filter(
+                    plan, start, loaded, filters, write, save, submit, stop, checkpoint_every, keep_frames=keep
+                )
         if start is not None and end == len(plan.files):
+            still_locked()
             check_there(plan, end, ending=True)
             if plan.video is not None:
                 preview.write_video(plan.video, _pictures(plan, options), fps=fps)
@@ -244,6 +248,7 @@ def _filter(
     loaded: Iterator[frames.LoadedFrame | None],
     make_filters: Callable[[], Filters],
     write: Callable[[int, frames.LoadedFrame, Output], FrameReport],
+    save_state: Callable[[Checkpoint], None],
     submit: Submit,
     stop: Callable[[], bool],
     checkpoint_every: int,
@@ -256,7 +261,7 @@ def _filter(
     def save(index: int) -> None:
         # A copy: the next step takes the history's memory.
         kept = None if history is None else to_host(history, plan.files[index - 1][1] or "")
-        submit(partial(checkpoint.save_checkpoint, plan.state, plan.identity, Checkpoint(index, kept)), after_all=True)
+        submit(partial(save_state, Checkpoint(index, kept)), after_all=True)
 
     for index in range(start.next_index, len(plan.files)):
         try:
@@ -287,6 +292,12 @@ def _filter(
     return len(plan.files)
 
 
+def _save(plan: Plan, still_locked: Callable[[], None], state: Checkpoint) -> None:
+    """Keep the history. Runs in a background thread, once every output before is complete."""
+    still_locked()
+    checkpoint.save_checkpoint(plan.state, plan.identity, state)
+
+
 def _identity(source: frames.Source, options: WriteOptions, provenance: Mapping[str, str]) -> checkpoint.Identity:
     """Whatever the outputs depend on, but for the parameters and the input frames."""
     return {
@@ -312,9 +323,7 @@ def _read(source: frames.Source, plan: Plan, index: int) -> frames.LoadedFrame |
     before = stamp_frame(plan, index)
     item = frames.read_frame(source, index)
     if stamp_frame(plan, index) != before:
-        raise SvgfError(
-            f"{item.path}: this frame's files changed while they were read. Go on with --resume once they are complete."
-        )
+        raise SvgfError(f"{item.path}: changed while it was read. Go on with --resume once it is complete.")
     if before != plan.identity["frames"][index]:
         plan.identity["frames"][index] = before
         item = item._replace(

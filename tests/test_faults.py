@@ -60,8 +60,9 @@ def test_an_output_folder_that_another_run_has_by_now(shot, tmp_path):
         (state_folder(out) / "lock").touch()
 
     with pytest.raises(SvgfError, match="lock is gone|cannot be written"):  # it may be writing just then
-        run(shot, out, on_frame=at(1, take), checkpoint_every=100)
+        run(shot, out, on_frame=at(1, take), checkpoint_every=3)
     assert len(contents(out)) <= 1
+    assert not (state_folder(out) / "checkpoint.npz").exists()
 
 
 def test_an_output_folder_that_nobody_may_look_into_any_more(shot, wanted, tmp_path, monkeypatch):
@@ -117,7 +118,7 @@ def test_an_input_that_changes_while_it_is_read(shot, wanted, tmp_path, monkeypa
 
     with monkeypatch.context() as patch:
         patch.setattr(streaming.frames, "read_frame", reading)
-        with pytest.raises(SvgfError, match=r"shot\.0005\.exr.*changed while they were read.*--resume"):
+        with pytest.raises(SvgfError, match=r"shot\.0005\.exr.*changed while it was read.*--resume"):
             run(shot, tmp_path / "out")
     assert run(shot, tmp_path / "out", resume=True).resumed_at == 4
     assert contents(tmp_path / "out") == wanted
