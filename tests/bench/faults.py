@@ -70,7 +70,7 @@ def kill(place: Place) -> Iterator[Row]:
 
 def signals(place: Place) -> Iterator[Row]:
     for name, number in (("SIGTERM", 15), ("Ctrl-C", 2), ("SIGHUP, the terminal closed", 1)):
-        for frame in (2, 20):
+        for frame in (2, 12):
             out = place.folder / f"{number}-{frame}"
             process = stopped_after(place, frame, denoise(place, out))
             process.send_signal(number)

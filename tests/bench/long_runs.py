@@ -207,7 +207,7 @@ def bench_drift(folder: Path, options: argparse.Namespace) -> list[str]:
     ]
     lines.append("|---|---|---|---|---|")
     runs = (both(0.2, 32.0), both(0.0, 1e9))
-    for ratio in (1.0, 1e2, 1e3, 1e4, 1e5, 1e6):
+    for ratio in (1.0, 1e2, 1e4, 1e6):
         errors = [np.asarray(run(jnp.float64(ratio))) for run in runs]
         cells = [f"{value:.1e}" for error in errors for value in (np.median(error[50:150]), np.median(error[-100:]))]
         lines.append(f"| {ratio:.0e} | {' | '.join(cells)} |")
