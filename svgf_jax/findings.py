@@ -222,6 +222,9 @@ def _motion(facts: Facts, renderer: str) -> Iterator[Finding]:
     fits, residuals = facts.motion.fits, facts.motion.residuals
     if not fits:
         judged = any(one.judged for one in residuals.values())
+        if judged and math.isinf(_off(facts, None)):
+            yield Finding("note", "motion", "the guides are too plain to tell a motion convention by.", "")
+            return
         moves, vectors = judged and _off(facts, None) > NEAR, residuals.keys() != {None}
         if not vectors and (moves or facts.moved):
             pixels = f"{facts.moved} pixels show another surface than in the frame before"

@@ -1,7 +1,11 @@
-"""The words in which an inspection's findings are told."""
+"""The words in which an inspection's findings are told, and the page about them."""
 
 import re
+from pathlib import Path
 
+from test_dry_run import run
+
+from svgf_jax import sample
 from svgf_jax.commands.inspect import _sentence
 from svgf_jax.findings import Finding, verdict
 from svgf_jax.remedies import REMEDIES, remedy
@@ -29,3 +33,15 @@ def test_a_verdict_counts():
     assert verdict((warning, note)) == "can run, 1 thing to mend"
     assert verdict((error, warning, warning)) == "cannot run: 1 error, 2 things to mend"
     assert verdict((error, error)) == "cannot run: 2 errors"
+
+
+DOCS = Path(__file__).parents[1] / "svgf_jax" / "docs"
+
+
+def test_the_page_shows_what_it_prints(capsys):
+    """Labels and sentences; numbers may differ in their last digit."""
+    page = (DOCS / "inspect.md").read_text(encoding="utf-8")
+    shown = re.search(r"```text\n(.*?)```", page, flags=re.DOTALL).group(1)
+    out = run(capsys, "inspect", sample(), "--motion", "y-up")[1]
+    words = [re.sub(r"\S*/\S*/\S*|[-\d.e]+", "", text).split() for text in (shown, out)]
+    assert words[0] == words[1]

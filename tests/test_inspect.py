@@ -16,6 +16,8 @@ from svgf_jax.commands.inspect import _light
 from svgf_jax.findings import judge, verdict
 from svgf_jax.frames import open_source
 from svgf_jax.inspection import inspect_source
+from svgf_jax.motion import Convention
+from svgf_jax.warping import Residual, Verdict
 
 
 def inspected(folder, **options):
@@ -267,6 +269,15 @@ def test_motion_that_is_read_wrongly_is_told(clean):
             assert any(one.topic == "motion" and "2.5 pixels off" in one.text for one in found) == told
 
 
+def test_guides_that_are_plain_tell_nothing_of_motion(clean):
+    facts, _ = inspected(clean)
+    plain = Residual(float("nan"), 1.0, (), 500)
+    for others in ({}, {Convention(): plain}):
+        found = {one.topic: one for one in judge(facts._replace(motion=Verdict({None: plain, **others}, ())))}
+        assert found["motion"].level == "note"
+        assert "too plain" in found["motion"].text
+
+
 def test_without_cameras_and_positions_it_says_what_it_cannot_tell(tmp_path, capsys):
     folder = write_room(tmp_path, numbers=range(2), cameras=False, drop=["position", "depth"])
     code, out, _ = run(capsys, "inspect", folder)
@@ -397,15 +408,3 @@ def test_files_that_renderers_wrote_are_understood(name, motion):
     if motion is not None:
         assert motion in map(str, facts.motion.fits)
         assert facts.samples == ("cycles.ViewLayer.samples", 1)
-
-
-DOCS = Path(__file__).parents[1] / "svgf_jax" / "docs"
-
-
-def test_the_page_shows_what_it_prints(capsys):
-    """Labels and sentences; numbers may differ in their last digit."""
-    page = (DOCS / "inspect.md").read_text(encoding="utf-8")
-    shown = re.search(r"```text\n(.*?)```", page, flags=re.DOTALL).group(1)
-    out = run(capsys, "inspect", sample(), "--motion", "y-up")[1]
-    words = [re.sub(r"\S*/\S*/\S*|[-\d.e]+", "", text).split() for text in (shown, out)]
-    assert words[0] == words[1]
