@@ -17,7 +17,8 @@ from tune.__main__ import app as tuner
 PAGE = Path(__file__).parents[1] / "svgf_jax" / "docs" / "commands.md"
 HEAD = """# Commands and flags
 
-All that the commands say of themselves when asked for help, on one page. A word in capitals stands for a value; the default is in brackets.
+All that the commands say of themselves when asked for help, on one page. A word in capitals stands for a value;
+the default is in brackets.
 
 *Written by `python tests/command_page.py`; a test holds it to be so, and nothing of it changes by accident.*
 """
