@@ -84,7 +84,8 @@ def flags_of(command):
     for word in command[1:]:
         found = found[word]
     names = {name for argument in found.assemble_argument_collection() for name in argument.names}
-    return names | {"--help", "-h", "--version", "--config"}
+    every = {name for argument in APPS[command[0]].meta.assemble_argument_collection() for name in argument.names}
+    return names | every | {"--help", "-h", "--version"}
 
 
 @cache
