@@ -41,8 +41,10 @@ def to_config(config) -> Config:
     return Config(**config)
 
 
-# Compiles in half the time, for tests of what is computed rather than of how; the real crops and the claims go without.
-QUICK = (("xla_backend_optimization_level", 0), ("xla_llvm_disable_expensive_passes", True))
+# For tests of how something is computed rather than of what: all else compiles quickly (conftest.py).
+AS_USERS: tuple = (("xla_backend_optimization_level", 3), ("xla_llvm_disable_expensive_passes", False))
+if jax.__version_info__[:2] == (0, 10):
+    AS_USERS += (("xla_cpu_use_fusion_emitters", True),)
 
 
 @functools.cache

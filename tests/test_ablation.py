@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 import shots
-from bridge import QUICK, jitted_denoise
+from bridge import jitted_denoise
 from test_api import frame_of_zeros
 from test_cli import command, observed
 
@@ -155,7 +155,7 @@ def test_the_command_prints_and_saves_the_table(folder, tmp_path):
     params, config = preset("paper")
     params = jax.tree.map(np.float32, params._replace(luminance_epsilon=0.1))
     frames = load_sequence(folder / "in")
-    _, output = jitted_denoise(config._replace(levels=1), QUICK)(frames, params=params)
+    _, output = jitted_denoise(config._replace(levels=1))(frames, params=params)
     images = zip(np.asarray(output.image), targets(folder), strict=True)
     noisy = [score for _, score in compare_sequences(folder / "in", folder / "ref")]
     for name, scores in (("levels-1", metrics.score_frames(images)), ("unfiltered", noisy)):

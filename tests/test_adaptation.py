@@ -197,7 +197,7 @@ def test_the_stage_is_what_its_docstring_says(size):
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), PARAMS._replace(light_sigma_normal=20.0))
     previous = reproject(jax.tree.map(jnp.asarray, history), frame, params=params)
     stage = functools.partial(follow_light, config=Config(light_cell=size))
-    got = jax.jit(stage, compiler_options=dict(bridge.QUICK))(previous, illumination, frame, params=params)
+    got = jax.jit(stage)(previous, illumination, frame, params=params)
     plain = jax.tree.map(np.asarray, frame)._asdict()
     wanted = follow_light_by_loops(
         jax.tree.map(np.asarray, previous)._asdict(),
@@ -239,7 +239,7 @@ def steady(noise: str, samples: int, config: Config = CONFIG):
     rng = np.random.default_rng(7)
     history = sj.init(lit(rng, noise, samples, 1.0))
     for _ in range(STEADY):
-        history, _ = bridge.jitted_step(config, bridge.QUICK)(history, lit(rng, noise, samples, 1.0), params=PARAMS)
+        history, _ = bridge.jitted_step(config)(history, lit(rng, noise, samples, 1.0), params=PARAMS)
     return history
 
 
@@ -250,7 +250,7 @@ def test_a_step_of_the_light_is_followed_at_once(noise, samples, factor):
     history, rng, travelled = steady(noise, samples), np.random.default_rng(8), []
     for _ in range(AFTER):
         frame = lit(rng, noise, samples, factor)
-        history, output = bridge.jitted_step(CONFIG, bridge.QUICK)(history, frame, params=PARAMS)
+        history, output = bridge.jitted_step(CONFIG)(history, frame, params=PARAMS)
         travelled.append((float(output.image.mean()) - 1.0) / (factor - 1.0))
     assert min(travelled[1:]) > 0.9, travelled
     assert max(travelled[1:]) < 1.1, travelled
@@ -271,12 +271,12 @@ def test_step_by_step_and_scan_agree_to_the_bit_and_bad_pixels_stay_out():
     frames = bridge.to_frames(scenes.synthetic(3, 29, 34, frames=3, signals=1, dirty=True), np.float32)
     lean = {"levels": 0, "variance": "temporal", "fallback": False, "reprojection": "nearest"}  # quick to compile
     config, params = Config(light_cell=4, **lean), Params()
-    _, scanned = bridge.jitted_denoise(config)(frames, params=params)
+    _, scanned = bridge.jitted_denoise(config, bridge.AS_USERS)(frames, params=params)
     history = None
     for t in range(3):
         frame = jax.tree.map(lambda leaf, t=t: leaf[t], frames)
         history = sj.init(frame) if history is None else history
-        history, output = bridge.jitted_step(config)(history, frame, params=params)
+        history, output = bridge.jitted_step(config, bridge.AS_USERS)(history, frame, params=params)
         jax.tree.map(lambda a, b, t=t: np.testing.assert_array_equal(a, b[t]), output, scanned)
         assert all(np.isfinite(a).all() for a in (output.illumination, output.change, history.moments))
     assert np.abs(output.change).max() > 0.1
@@ -299,16 +299,15 @@ def test_it_is_differentiable_in_its_parameters_and_the_history():
         followed = follow_light(previous, frame.radiance, frame, params=params, config=Config(light_cell=4))
         return jnp.sum(jnp.tanh(followed.illumination)) + jnp.sum(jnp.tanh(followed.moments)) + jnp.sum(followed.change)
 
-    options = {"compiler_options": dict(bridge.QUICK)}
     values = tuple(jnp.asarray(v, jnp.float64) for v in (1.0, 1.0, 64.0))
-    reverse = jax.jit(jax.grad(error, argnums=(0, 1)), **options)(values, past)
+    reverse = jax.jit(jax.grad(error, argnums=(0, 1)))(values, past)
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(reverse))
     assert all(float(g) != 0.0 for g in reverse[0][:2])
     towards = (
         tuple(jnp.asarray(v) for v in (0.3, -0.2, 1.0)),
         past * rng.normal(size=past.shape),
     )  # what is dark stays dark: 0 is a kink
-    forward = jax.jit(lambda at: jax.jvp(error, at, towards), **options)
+    forward = jax.jit(lambda at: jax.jvp(error, at, towards))
     slope = forward((values, past))[1]
     wanted = sum(jnp.sum(g * d) for g, d in zip(jax.tree.leaves(reverse), jax.tree.leaves(towards), strict=True))
     np.testing.assert_allclose(slope, wanted, rtol=1e-8)
@@ -337,7 +336,7 @@ def test_a_firefly_is_no_change_of_the_light(brightness):
     bright = frame.radiance.copy()
     bright[0, 55, 61] = brightness
     outputs = [
-        bridge.jitted_step(CONFIG, bridge.QUICK)(steady("uniform", 4), frame._replace(radiance=r), params=PARAMS)[1]
+        bridge.jitted_step(CONFIG)(steady("uniform", 4), frame._replace(radiance=r), params=PARAMS)[1]
         for r in (frame.radiance, bright)
     ]
     changes = [np.abs(np.asarray(output.change)) for output in outputs]
@@ -359,5 +358,5 @@ def test_the_effective_number_is_that_of_the_errors_seen(levels):
         return effective[size // 2, size // 2], mean.current[0][size // 2, size // 2]
 
     noise = np.random.default_rng(6).normal(size=(trials, size, size))
-    effective, means = jax.jit(lambda n: jax.lax.map(pooled, n), compiler_options=dict(bridge.QUICK))(noise)
+    effective, means = jax.jit(lambda n: jax.lax.map(pooled, n))(noise)
     assert np.var(means) == pytest.approx(float(effective[0]), rel=0.15)

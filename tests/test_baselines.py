@@ -9,7 +9,7 @@ import numpy as np
 import oracle_games202 as oracle
 import pytest
 import scenes
-from bridge import QUICK, to_frame
+from bridge import AS_USERS, to_frame
 
 from svgf_jax import SvgfError, exr, streaming
 from svgf_jax.baselines import baseline_denoise, baseline_init, baseline_step, filter_alone, one_signal
@@ -58,13 +58,13 @@ def chosen(name, dtype=np.float64):
 
 
 @functools.cache
-def jitted(config):
-    return jax.jit(functools.partial(baseline_step, config=config), compiler_options=dict(QUICK))
+def jitted(config, options=()):
+    return jax.jit(functools.partial(baseline_step, config=config), compiler_options=dict(options))
 
 
-def run(frames, name, dtype=np.float64):
+def run(frames, name, dtype=np.float64, options=()):
     params, config = chosen(name, dtype)
-    go, history, results = jitted(config), baseline_init(to_frame(frames[0], dtype)), []
+    go, history, results = jitted(config, options), baseline_init(to_frame(frames[0], dtype)), []
     for frame in frames:
         history, output = go(history, to_frame(frame, dtype), params=params)
         results.append(jax.tree.map(np.asarray, (history, output)))
@@ -115,9 +115,9 @@ def test_the_homework_is_the_loops(data):
 def test_a_sequence_is_its_steps():
     params, config = chosen("games202")
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *map(to_frame, moving()))
-    sequence = jax.jit(functools.partial(baseline_denoise, config=config), compiler_options=dict(QUICK))
+    sequence = jax.jit(functools.partial(baseline_denoise, config=config), compiler_options=dict(AS_USERS))
     history, outputs = sequence(stacked, params=params)
-    steps = run(moving(), "games202")
+    steps = run(moving(), "games202", options=AS_USERS)
     jax.tree.map(np.testing.assert_array_equal, history, steps[-1][0])
     for t, (_, output) in enumerate(steps):
         jax.tree.map(lambda a, b, t=t: np.testing.assert_array_equal(a[t], b), outputs, output)
@@ -136,9 +136,7 @@ def test_gradients_are_finite():
         _, output = baseline_step(history, second._replace(**inputs), params=params, config=config)
         return (output.image**2).mean()
 
-    gradients = jax.jit(jax.grad(loss, argnums=(0, 1), allow_int=True), compiler_options=dict(QUICK))(
-        params, inputs, history
-    )
+    gradients = jax.jit(jax.grad(loss, argnums=(0, 1), allow_int=True))(params, inputs, history)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
     assert all(np.asarray(leaf) != 0 for leaf in gradients[0])
 

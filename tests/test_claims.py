@@ -6,7 +6,7 @@ import numpy as np
 import oracle
 import pytest
 import scenes
-from bridge import QUICK, jitted_denoise, jitted_step, run, to_config, to_frame, to_frames, to_history, to_params
+from bridge import AS_USERS, jitted_denoise, jitted_step, run, to_config, to_frame, to_frames, to_history, to_params
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -212,7 +212,7 @@ def test_a_tie_in_the_depth_gradient_takes_no_side():
 def test_signals_do_not_touch_each_other(seed):
     frames = awkward(seed, frames=3)
     swapped = [f | {"radiance": f["radiance"][::-1]} for f in frames]
-    for (_, a), (_, b) in zip(run(frames, config=LIGHT), run(swapped, config=LIGHT), strict=True):
+    for (_, a), (_, b) in zip(*(run(f, config=LIGHT, options=AS_USERS) for f in (frames, swapped)), strict=True):
         np.testing.assert_array_equal(b.illumination, a.illumination[::-1])
         np.testing.assert_array_equal(b.variance, a.variance[::-1])
 
@@ -220,7 +220,7 @@ def test_signals_do_not_touch_each_other(seed):
 def test_one_albedo_for_all_signals_is_the_same_albedo_for_each():
     frames = awkward(3, frames=3)
     each = [f | {"albedo": np.repeat(f["albedo"], 2, axis=0)} for f in frames]
-    for (_, a), (_, b) in zip(run(frames, config=LIGHT), run(each, config=LIGHT, options=QUICK), strict=True):
+    for (_, a), (_, b) in zip(run(frames, config=LIGHT), run(each, config=LIGHT), strict=True):
         np.testing.assert_allclose(b.image, a.image, rtol=1e-12)
 
 
@@ -339,7 +339,7 @@ def test_bad_pixels_are_counted_and_never_come_out(dtype, seed):
 @BOTH
 def test_step_by_step_and_denoise_agree_to_the_bit(dtype):
     frames = awkward(21, frames=3, dirty=True)
-    results = run(frames, config=LIGHT, dtype=dtype)
+    results = run(frames, config=LIGHT, dtype=dtype, options=AS_USERS)
     history, outputs = whole_sequence(to_frames(frames, dtype), dtype)
     assert_same_bits(history, results[-1][0])
     for t, (_, output) in enumerate(results):
@@ -348,7 +348,7 @@ def test_step_by_step_and_denoise_agree_to_the_bit(dtype):
 
 def whole_sequence(frames, dtype=np.float64, history=None):
     history = init(jax.tree.map(lambda leaf: leaf[0], frames)) if history is None else history
-    return jitted_denoise(to_config(LIGHT))(frames, history=history, params=to_params(oracle.PAPER, dtype))
+    return jitted_denoise(to_config(LIGHT), AS_USERS)(frames, history=history, params=to_params(oracle.PAPER, dtype))
 
 
 @pytest.mark.parametrize("cut", [1, 2])
@@ -365,7 +365,7 @@ def test_vmap_over_a_batch_is_the_loop_over_it():
     sequences = [to_frames(awkward(seed, frames=3)) for seed in (31, 32, 33)]
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *sequences)
     go = jax.vmap(lambda frames: denoise(frames, params=to_params(oracle.PAPER), config=to_config(LIGHT)))
-    _, outputs = jax.jit(go, compiler_options=dict(QUICK))(batch)
+    _, outputs = jax.jit(go)(batch)
     for i, frames in enumerate(sequences):
         close = lambda a, b, i=i: np.testing.assert_allclose(np.asarray(a)[i], b, rtol=1e-11, atol=1e-11)  # noqa: E731
         jax.tree.map(close, outputs, whole_sequence(frames)[1])
@@ -377,7 +377,7 @@ def test_parameters_may_be_vmapped_over():
     config, paper = to_config(LIGHT), to_params(oracle.PAPER)
     floors = jnp.array([1e-3, 0.5])
     go = jax.vmap(lambda floor: step(init(frame), frame, params=paper._replace(albedo_floor=floor), config=config))
-    _, outputs = jax.jit(go, compiler_options=dict(QUICK))(floors)
+    _, outputs = jax.jit(go)(floors)
     for i in range(2):
         _, expected = one_step(init(frame), frame._asdict(), oracle.PAPER | {"albedo_floor": floors[i]})
         np.testing.assert_allclose(outputs.image[i], expected.image, rtol=1e-11, atol=1e-11)

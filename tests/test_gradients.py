@@ -8,7 +8,7 @@ import numpy as np
 import oracle
 import pytest
 import scenes
-from bridge import QUICK, to_config, to_frames, to_params
+from bridge import to_config, to_frames, to_params
 
 from svgf_jax.pipeline import denoise
 from svgf_jax.types import Params
@@ -70,10 +70,9 @@ def loss_of_inputs(params, inputs, frames):
     return loss(params, frames._replace(**inputs))
 
 
-jit = functools.partial(jax.jit, compiler_options=dict(QUICK))
-value = jit(loss)
-forward = jit(jax.jacfwd(loss))
-reverse = jit(jax.grad(loss_of_inputs, argnums=(0, 1)))  # with respect to parameters and inputs
+value = jax.jit(loss)
+forward = jax.jit(jax.jacfwd(loss))
+reverse = jax.jit(jax.grad(loss_of_inputs, argnums=(0, 1)))  # with respect to parameters and inputs
 
 
 def inputs_of(frames):

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import oracle_classic as oracle
 import pytest
-from bridge import QUICK
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -51,7 +50,7 @@ def run(name, s, *, mask=None, dtype=np.float64, sigmas=None, **static):
     """The library's filter, jitted; read from its module when it runs, so that `test_mutants` can put a broken one there."""
     function = getattr(joint_bilateral, SETTINGS[name][0])
     call = lambda image, traced, mask: function(image, **traced, mask=mask, **static)  # noqa: E731
-    jitted = jax.jit(call, compiler_options=dict(QUICK))
+    jitted = jax.jit(call)
     return np.asarray(jitted(s["image"].astype(dtype), arguments(name, s, sigmas, dtype), mask))
 
 
@@ -103,7 +102,7 @@ def test_a_broken_pixel_becomes_the_mean_of_the_others(name, footprint):
     value = lambda inputs: jnp.where(s["mask"][..., None], function(inputs[0], **inputs[1]), 0.0).sum()  # noqa: E731
     inputs = (s["image"], arguments(name, s))
     slopes = lambda x: (jax.grad(value)(x), jax.jvp(value, (x,), (jax.tree.map(jnp.ones_like, x),)))  # noqa: E731
-    found = jax.jit(slopes, compiler_options=dict(QUICK))(inputs)
+    found = jax.jit(slopes)(inputs)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
 
 
@@ -134,7 +133,6 @@ def test_an_atrous_gaussian_is_as_wide_as_the_window(last_pass):
         lambda image, sigma: joint_bilateral.gaussian_filter(
             image, sigma=sigma, radius=8, footprint="atrous", last_pass=last_pass
         ),
-        compiler_options=dict(QUICK),
     )
     impulse = np.eye(1, 81, 40)[..., None]
     distance = np.arange(81) - 40
@@ -152,7 +150,7 @@ def property_case(footprint):
     function = lambda image, traced, mask: joint_bilateral.joint_bilateral_filter(  # noqa: E731
         image, **traced, mask=mask, radius=3, footprint=footprint
     )
-    return s, jax.jit(function, compiler_options=dict(QUICK))
+    return s, jax.jit(function)
 
 
 @pytest.mark.parametrize("footprint", joint_bilateral.FOOTPRINTS)
@@ -193,8 +191,8 @@ def compiled_slopes(name, mask):
         filtered = jnp.where(mask[..., None], function(inputs[0], **inputs[1]), 0.0)
         return jnp.sum(jnp.asarray(WEIGHTS, filtered.dtype) * jnp.tanh(filtered))
 
-    forward = jax.jit(lambda inputs, along: jax.jvp(value, (inputs,), (along,)), compiler_options=dict(QUICK))
-    return forward, jax.jit(jax.grad(value), compiler_options=dict(QUICK))
+    forward = jax.jit(lambda inputs, along: jax.jvp(value, (inputs,), (along,)))
+    return forward, jax.jit(jax.grad(value))
 
 
 @pytest.mark.parametrize("name", PARTS)

@@ -91,21 +91,6 @@ class Parameters:
         pass
 
 
-@pytest.fixture
-def quick(monkeypatch, tmp_path):
-    """What the page jits, and the filter, compile quickly; files go to a folder of their own."""
-    options = dict(bridge.QUICK)
-    step, compiled = svgf.step, jax.jit(svgf.step, static_argnames="config", compiler_options=options)
-
-    def quick_step(history, frame, **chosen):
-        inside = isinstance(frame.radiance, jax.core.Tracer)  # of another jit, which has the options itself
-        return (step if inside else compiled)(history, frame, **chosen)
-
-    monkeypatch.setattr(svgf, "step", quick_step)
-    monkeypatch.setattr(jax, "jit", partial(jax.jit, compiler_options=options))
-    monkeypatch.chdir(tmp_path)
-
-
 def run(examples, names, capsys):
     for example in examples:
         exec(compile(example, "library.md", "exec"), names)
@@ -113,7 +98,8 @@ def run(examples, names, capsys):
         assert printed == re.findall(r"^print\(.*\)  # (.*)$", example, flags=re.MULTILINE), example
 
 
-def test_the_examples_run(quick, capsys, monkeypatch):
+def test_the_examples_run(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "mitsuba", stand_in())
     names = {}
     exec(MATRICES, names)

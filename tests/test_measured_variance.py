@@ -7,7 +7,7 @@ import oracle
 import pytest
 import scenes
 import shots
-from bridge import QUICK, relative_error, to_config, to_frame, to_params
+from bridge import relative_error, to_config, to_frame, to_params
 
 from svgf_jax import exr, moments
 from svgf_jax.accumulation import accumulate
@@ -142,7 +142,7 @@ def test_measured_variances_against_plain_loops(estimator):
         lengths = accumulated.history_length
         return accumulated, estimate_variance(accumulated.moments, lengths, frame, params=params, config=config)
 
-    go = jax.jit(both, compiler_options=dict(QUICK))
+    go = jax.jit(both)
     accumulated, got = go(to_frame(raw), light, previous, to_params(params))
     assert (length >= 4 - 1e-3).any()
     assert ((length > 0) & (length < 4 - 1e-3)).any()
@@ -168,7 +168,7 @@ def test_the_variance_of_the_pixels_mean_is_unbiased():
         variance = estimate_variance(accumulated.moments, length, frame, params=params)
         return Reprojected(*accumulated, valid=jnp.ones_like(length, bool)), variance
 
-    go = jax.jit(both, compiler_options=dict(QUICK))
+    go = jax.jit(both)
     empty = init(to_frame(frame))
     nothing = Reprojected(empty.illumination, empty.moments, empty.history_length, jnp.zeros(size, bool))
     previous = nothing
@@ -195,7 +195,7 @@ def test_measured_variances_have_finite_gradients():
         v = estimate_variance(accumulated.moments, accumulated.history_length, clean, params=params)
         return jnp.mean(jnp.sqrt(v + 1))
 
-    go = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2, 3)), compiler_options=dict(QUICK))
+    go = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2, 3)))
     found = go(frame.variance, frame.radiance, light, to_params(params, np.float32))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
 

@@ -6,7 +6,7 @@ import numpy as np
 import oracle_classic as oracle
 import pytest
 import scenes
-from bridge import QUICK, to_config, to_frame, to_params
+from bridge import to_config, to_frame, to_params
 
 from svgf_jax import outliers, pipeline
 from svgf_jax.types import Config, SvgfError
@@ -32,7 +32,7 @@ def removed(light, frame, sigma, radius, dtype=np.float64, **options):
     config = to_config(CONFIG | {"outlier_radius": radius})
     call = lambda light, frame, params: outliers.remove_outliers(light, frame, params=params, config=config, **options)  # noqa: E731
     params = to_params({"outlier_sigma": [sigma, 99.0]}, dtype)
-    return np.asarray(jax.jit(call, compiler_options=dict(QUICK))(light.astype(dtype), to_frame(frame, dtype), params))
+    return np.asarray(jax.jit(call)(light.astype(dtype), to_frame(frame, dtype), params))
 
 
 @pytest.mark.parametrize(("radius", "sigma"), [(1, 0.5), (3, 3.0)])
@@ -50,14 +50,14 @@ def test_an_image_alone():
     frame, light = scene()
     mask, image = frame["object_id"] != -1, np.where((frame["object_id"] == -1)[..., None], np.nan, light[0])
     function = lambda i: outliers.clamp_outliers(i, radius=1, sigma=0.5, mask=mask)  # noqa: E731
-    clamped = jax.jit(function, compiler_options=dict(QUICK))
+    clamped = jax.jit(function)
     wanted = oracle.remove_outliers(light[0], mask, 1, 0.5)
     np.testing.assert_allclose(clamped(image)[mask], wanted[mask], rtol=1e-9, atol=1e-9)
     assert np.isnan(clamped(image)[~mask]).all()
     image[mask] = np.where(np.arange(3) == 0, np.nan, np.where(np.arange(3) == 1, np.inf, image[mask]))
     assert np.isfinite(clamped(image)[mask]).all()
     total = lambda i: jnp.where(mask[..., None], function(i), 0.0).sum()  # noqa: E731
-    assert np.isfinite(jax.jit(jax.grad(total), compiler_options=dict(QUICK))(image)).all()
+    assert np.isfinite(jax.jit(jax.grad(total))(image)).all()
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_fireflies_do_not_enter_the_history():
     surface = frame["object_id"] != -1
     cleaned = np.stack([oracle.remove_outliers(s, surface, 2, 3.0) for s in light])
     config = Config(levels=0, outlier_radius=2)
-    step = jax.jit(lambda *a, params: pipeline.step(*a, params=params, config=config), compiler_options=dict(QUICK))
+    step = jax.jit(lambda *a, params: pipeline.step(*a, params=params, config=config))
     results = []
     for sigma, radiance in ((3.0, light), (1e9, cleaned), (1e9, light)):
         this = to_frame(frame | {"radiance": radiance})
@@ -114,8 +114,8 @@ def test_gradients():
         cleaned = outliers.remove_outliers(light, frame, params=params, config=config)
         return jnp.sum(weights * jnp.tanh(cleaned))
 
-    forward = jax.jit(lambda l, s, dl, ds: jax.jvp(value, (l, s), (dl, ds)), compiler_options=dict(QUICK))
-    reverse = jax.jit(jax.grad(value, argnums=(0, 1)), compiler_options=dict(QUICK))
+    forward = jax.jit(lambda l, s, dl, ds: jax.jvp(value, (l, s), (dl, ds)))
+    reverse = jax.jit(jax.grad(value, argnums=(0, 1)))
     light[:, :, -3:] += 0.1 * rng.random(light[:, :, -3:].shape)  # a difference across a kink is no derivative
     one = np.float64(1.5)
     back = reverse(light, one)

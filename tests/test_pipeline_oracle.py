@@ -6,7 +6,7 @@ import numpy as np
 import oracle
 import pytest
 import scenes
-from bridge import PRESETS, QUICK, relative_error, run, worst
+from bridge import AS_USERS, PRESETS, relative_error, run, worst
 
 REAL_FRAMES = 4  # enough for history lengths on both sides of 4
 PER_LEVEL = oracle.PAPER | {
@@ -86,14 +86,14 @@ def assert_float32(results, expected):
 def test_real_crop_float64(data, name, preset):
     frames, expected = real_case(data, name, preset)
     assert (expected[-1]["history_length"] >= 4 - 1e-3).any()
-    assert_float64(run(frames, *PRESETS[preset]), expected)
+    assert_float64(run(frames, *PRESETS[preset], options=AS_USERS), expected)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", scenes.CROPS)
 def test_real_crop_float32(data, name, preset):
     frames, expected = real_case(data, name, preset)
-    assert_float32(run(frames, *PRESETS[preset], dtype=np.float32), expected)
+    assert_float32(run(frames, *PRESETS[preset], dtype=np.float32, options=AS_USERS), expected)
 
 
 @pytest.mark.parametrize("case", SYNTHETIC)
@@ -101,7 +101,7 @@ def test_synthetic_float64(case):
     make, params, config = SYNTHETIC[case]
     frames = make()
     expected = oracle.denoise(frames, params, config)
-    results = run(frames, params, config, options=QUICK)
+    results = run(frames, params, config)
     assert_float64(results, expected)
     for (_, output), wanted in zip(results, expected, strict=True):
         assert {k: int(v) for k, v in output.rejected._asdict().items()} == wanted["rejected"]
@@ -110,7 +110,7 @@ def test_synthetic_float64(case):
 def test_synthetic_float32():
     frames = scenes.synthetic(11, 32, 33, frames=6)
     assert_float32(
-        run(frames, oracle.FALCOR, oracle.FALCOR_CONFIG, np.float32, QUICK),
+        run(frames, oracle.FALCOR, oracle.FALCOR_CONFIG, np.float32),
         oracle.denoise(frames, oracle.FALCOR, oracle.FALCOR_CONFIG),
     )
 
@@ -119,4 +119,4 @@ def test_synthetic_float32():
 def test_any_size(height, width):
     frames = scenes.synthetic(height + 10 * width, height, width, frames=5)
     config = {"levels": 2, "feedback_level": 0}
-    assert_float64(run(frames, oracle.PAPER, config, options=QUICK), oracle.denoise(frames, oracle.PAPER, config))
+    assert_float64(run(frames, oracle.PAPER, config), oracle.denoise(frames, oracle.PAPER, config))

@@ -123,7 +123,7 @@ def frames_of_a_mirror(reflected=True):
 
 
 def test_the_history_of_a_reflection_is_where_it_was():
-    step, errors = bridge.jitted_step(Config(levels=0, variance="temporal"), bridge.QUICK), {}
+    step, errors = bridge.jitted_step(Config(levels=0, variance="temporal")), {}
     for reflected in (True, False):
         frames = frames_of_a_mirror(reflected)
         history = sj.init(frames[0])

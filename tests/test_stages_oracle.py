@@ -12,7 +12,7 @@ import oracle
 import oracle_taa
 import pytest
 import scenes
-from bridge import QUICK, relative_error, to_config, to_frame, to_history, to_params
+from bridge import relative_error, to_config, to_frame, to_history, to_params
 
 from svgf_jax import accumulation, antialiasing, atrous, color, edges, pipeline, reprojection, sanitation, variance
 from svgf_jax.types import Reprojected, TaaHistory
@@ -70,9 +70,7 @@ def case():
 
 
 def compiled(function, *arguments, **static):
-    return jax.tree.map(
-        np.asarray, jax.jit(functools.partial(function, **static), compiler_options=dict(QUICK))(*arguments)
-    )
+    return jax.tree.map(np.asarray, jax.jit(functools.partial(function, **static))(*arguments))
 
 
 def assert_close(actual, expected, tolerance=1e-9):

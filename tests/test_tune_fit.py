@@ -9,11 +9,11 @@ import numpy as np
 import optimistix as optx
 import pytest
 import scenes
-from bridge import QUICK, to_frames
+from bridge import to_frames
 
 import tune
 from svgf_jax import Config, Frame, Params, SvgfError, denoise, tonemap
-from tune import checkpoint, tangents
+from tune import checkpoint
 from tune import solver as solvers
 from tune.free import choose, from_free, to_free
 from tune.residuals import (
@@ -30,7 +30,6 @@ from tune.residuals import (
 from tune.shots import shot_of_arrays, window
 from tune.sweep import GATE_STEP, pose, sweep
 
-tangents.COMPILER_OPTIONS.update(QUICK)
 CONFIG = Config(levels=1)  # less to compile
 NAMES = ("alpha", "sigma_luminance", "sigma_normal")
 TRUE = Params(alpha=0.45, sigma_luminance=2.0, sigma_normal=60.0)
@@ -66,13 +65,28 @@ def dense_residual(posed, y):
     return jnp.concatenate([error.reshape(-1) * np.sqrt(share), change.reshape(-1) * np.sqrt(share * 0.5)])
 
 
+@functools.cache
+def dense_derivatives():
+    """`dense_residual` and its Jacobian, compiled once."""
+    residual = functools.partial(dense_residual, problem())
+    return jax.jit(lambda y: (residual(y), jax.jacfwd(residual)(y)))
+
+
 def test_iterates_are_those_of_the_dense_solver():
     """Four steps of `optx.least_squares` on every residual at once end where four on the triangle do."""
-    posed = problem()
+    posed, dense = problem(), dense_derivatives()
+    shapes = jax.eval_shape(dense, posed.y_start)
+    call = lambda y: jax.pure_callback(lambda y: jax.tree.map(np.asarray, dense(y)), shapes, y)  # noqa: E731
+    scaled = jax.custom_jvp(lambda y: np.sqrt(solvers.SCALE) * call(y)[0])
+
+    @scaled.defjvp
+    def _(y, along):
+        residual, jacobian = call(y[0])
+        return np.sqrt(solvers.SCALE) * residual, np.sqrt(solvers.SCALE) * (jacobian @ along[0])
+
     solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
-    function = lambda y, _: np.sqrt(solvers.SCALE) * dense_residual(posed, y)  # noqa: E731
-    solve = lambda y: optx.least_squares(function, solver, y, max_steps=4, throw=False).value  # noqa: E731
-    wanted = jax.jit(solve, compiler_options=dict(QUICK))(jnp.asarray(posed.y_start))
+    start = jnp.asarray(posed.y_start)
+    wanted = optx.least_squares(lambda y, _: scaled(y), solver, start, max_steps=4, throw=False).value
     descent = solvers.begin(solver, posed.y_start)
     for _ in range(4):
         descent, _ = solvers.advance(descent, sweep(posed, descent.trial, linear=True).triangle)
@@ -84,9 +98,7 @@ def test_triangle_holds_the_dense_products():
     posed = problem(terms=(*TERMS, REFERENCE[2]), tangent_batch=2)
     y = posed.y_start + np.array([0.2, -0.1, 0.3])
     found = sweep(posed, y, linear=True)
-    r = np.asarray(dense_residual(posed, jnp.asarray(y)))
-    dense = jax.jit(jax.jacfwd(lambda y: dense_residual(posed, y)), compiler_options=dict(QUICK))
-    j = np.asarray(dense(jnp.asarray(y)))
+    r, j = map(np.asarray, dense_derivatives()(jnp.asarray(y)))
     away = (y - posed.y_start) * np.sqrt(0.02 / 3)
     rows = np.vstack([np.column_stack([j, r]), np.column_stack([np.eye(3) * np.sqrt(0.02 / 3), away])])
     np.testing.assert_allclose(found.triangle.T @ found.triangle, rows.T @ rows, rtol=1e-9)
@@ -138,7 +150,7 @@ def test_per_level_values_and_a_degenerate_parameter_is_named_and_stays():
     noisy, _ = made()
     two, levels = Config(levels=2), np.array([1.5, 5.0])
     truth = TRUE._replace(sigma_luminance=levels)
-    run = jax.jit(functools.partial(denoise, config=two), compiler_options=dict(QUICK))
+    run = jax.jit(functools.partial(denoise, config=two))
     target = run(noisy, params=Params(*map(jnp.asarray, truth)))[1].image
     names = ("sigma_luminance", "max_history")
     little = reference_terms(prior_weight=1e-3)
@@ -265,7 +277,8 @@ def test_gates_are_differentiated_across_a_step():
     posed = problem(Params(reproject_depth=0.0025, alpha=0.3), names=names)
     found = sweep(posed, posed.y_start, linear=True).triangle
     step = np.array([GATE_STEP, 0.0])
-    above, below, here = (dense_residual(posed, jnp.asarray(posed.y_start + s)) for s in (step, -step, 0 * step))
+    dense = jax.jit(functools.partial(dense_residual, posed))
+    above, below, here = (dense(jnp.asarray(posed.y_start + s)) for s in (step, -step, 0 * step))
     column = (np.asarray(above) - np.asarray(below)) / (2 * GATE_STEP)
     assert np.abs(column).max() > 0
     gram = found.T @ found

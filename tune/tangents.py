@@ -17,9 +17,6 @@ from svgf_jax import Config, Frame, History, Params, init, step
 from tune.free import Free, from_free
 from tune.residuals import Seen, Term
 
-COMPILER_OPTIONS: dict[str, Any] = {}
-"""XLA's, for what is compiled from here on."""
-
 
 class Carry(NamedTuple):
     """Between two frames: the history, and the frame before as the residuals see it."""
@@ -79,9 +76,10 @@ class FramePass(NamedTuple):
 def compile_pass(free: tuple[Free, ...], config: Config, terms: tuple[Term, ...]) -> FramePass:
     """The functions that run one frame at free coordinates `y` `[n]`, residuals in the order of `terms`; compiled once."""
     one = partial(_one_frame, free=free, config=config, terms=terms)
-    jit = partial(jax.jit, compiler_options=dict(COMPILER_OPTIONS))
     return FramePass(
-        start=jit(partial(_start, config)), plain=jit(partial(_plain, one)), linear=jit(partial(_linear, one))
+        start=jax.jit(partial(_start, config)),
+        plain=jax.jit(partial(_plain, one)),
+        linear=jax.jit(partial(_linear, one)),
     )
 
 
