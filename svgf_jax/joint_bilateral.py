@@ -42,6 +42,7 @@ from svgf_jax.types import SvgfError
 FOOTPRINTS = ("full", "separable", "atrous")
 _NEVER = 1e3  # exp(-this) is 0 in every float type
 _LARGEST = 1e15  # guides beyond are cut off: squares of their differences stay finite
+_LARGE = 2.0**64
 _SMALLEST_SIGMA = 1e-9
 _LEAST_WEIGHT = 1e-15  # below, a sum of weights counts as zero
 _SAME_POINT = 1e-18  # squared distance below which D_plane is 0
@@ -190,7 +191,10 @@ def joint_bilateral_filter(
         plane=_falloff(sigma_plane, dtype),
         others=tuple(_falloff(sigma, dtype) for _, sigma in guides),
     )
-    sums = tuple(jnp.where(counts, plane, 0.0) for plane in planes(image)), counts.astype(dtype)
+    # Sums of large colors, and what their derivatives pass through, would overflow; a power of two changes no digit.
+    large = jnp.max(jnp.abs(image), where=counts[..., None], initial=0.0) > _LARGE
+    scale = jnp.where(large, _LARGE, jnp.ones((), dtype))
+    sums = tuple(jnp.where(counts, plane, 0.0) / scale for plane in planes(image)), counts.astype(dtype)
     space = _falloff(sigma_space, dtype)
     gather = functools.partial(_gather, guide=guide, falloff=falloff)
     if footprint == "atrous":
@@ -207,7 +211,7 @@ def joint_bilateral_filter(
     counted = wanted & (weight > _LEAST_WEIGHT)
     divisor = jnp.where(counted, weight, 1.0)
     kept = planes(jnp.where((wanted & ~finite)[..., None], 0.0, image))
-    return jnp.stack([jnp.where(counted, c / divisor, own) for c, own in zip(colors, kept, strict=True)], axis=-1)
+    return jnp.stack([jnp.where(counted, c / divisor * scale, own) for c, own in zip(colors, kept, strict=True)], axis=-1)
 
 
 class Guide(NamedTuple):
