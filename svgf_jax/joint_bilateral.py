@@ -211,7 +211,9 @@ def joint_bilateral_filter(
     counted = wanted & (weight > _LEAST_WEIGHT)
     divisor = jnp.where(counted, weight, 1.0)
     kept = planes(jnp.where((wanted & ~finite)[..., None], 0.0, image))
-    return jnp.stack([jnp.where(counted, c / divisor * scale, own) for c, own in zip(colors, kept, strict=True)], axis=-1)
+    return jnp.stack(
+        [jnp.where(counted, c / divisor * scale, own) for c, own in zip(colors, kept, strict=True)], axis=-1
+    )
 
 
 class Guide(NamedTuple):

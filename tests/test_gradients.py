@@ -1,7 +1,5 @@
 """Gradients: forward = reverse = finite differences for every parameter through four frames, and finite everywhere."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np

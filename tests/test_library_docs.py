@@ -2,16 +2,11 @@
 
 import re
 import sys
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
-import bridge
-import jax
 import numpy as np
 import pytest
-
-import svgf_jax as svgf
 
 DOCS = Path(__file__).parents[1] / "svgf_jax" / "docs"
 PAGE = (DOCS / "library.md").read_text(encoding="utf-8")
