@@ -147,9 +147,9 @@ def test_a_history_not_worth_keeping_is_kept_shorter():
     luma = light @ [0.2126, 0.7152, 0.0722]
     for s, weight in enumerate((0.2, 0.5, 1.0)):
         np.testing.assert_allclose(got.illumination[s], (1 - weight) * old[s] + weight * light[s], rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(
-            got.moments[s, ..., 0], (1 - weight) * moments[s, ..., 0] + weight * luma[s], rtol=1e-6, atol=1e-9
-        )
+        for which, new in enumerate((luma[s], luma[s] ** 2)):
+            wanted = (1 - weight) * moments[s, ..., which] + weight * new
+            np.testing.assert_allclose(got.moments[s, ..., which], wanted, rtol=1e-6, atol=1e-9)
 
 
 def test_files_with_hit_distances_give_frames_their_reflections(tmp_path):
