@@ -22,7 +22,7 @@ import numpy as np
 from svgf_jax import exr
 from svgf_jax.demo import sample
 
-WHAT = "--tune alpha,sigma_luminance,max_history --set levels=1 --frames 0-5 --max-steps 5".split()
+WHAT = ["--tune", "alpha,sigma_luminance,max_history", "--set", "levels=1", "--frames", "0-5", "--max-steps", "5"]
 
 
 def numbers(path: Path) -> str:
