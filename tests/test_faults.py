@@ -226,6 +226,33 @@ def test_a_terminal_that_is_closed_stops_the_run_after_its_frame():
     assert shell('"$@"', "-c", STOPPED) == (100 + signal.SIGHUP, "")
 
 
+DRAWN = """
+import sys, time
+from svgf_jax.commands import terminal
+with terminal.bar(3) as advance:
+    sys.stdin.readline()
+    advance("frame 1")
+    time.sleep(0.2)
+terminal.tell("done")
+sys.exit(100)
+"""
+
+
+def test_a_terminal_that_goes_without_a_word_does_not_end_a_run():
+    """As after `disown`: no SIGHUP, but what is drawn cannot be."""
+    pty = pytest.importorskip("pty")
+    reading, writing = pty.openpty()
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "TERM": "xterm"}
+    process = subprocess.Popen([sys.executable, "-c", DRAWN], stdin=subprocess.PIPE, stderr=writing, env=environment)
+    os.close(writing)
+    shown = b""
+    while b"compiling" not in shown:
+        shown += os.read(reading, 1000)
+    os.close(reading)
+    process.communicate(b"\n", timeout=60)
+    assert process.returncode == 100
+
+
 def test_a_video_has_the_same_bytes_every_time(tmp_path):
     pytest.importorskip("av")
     import numpy as np

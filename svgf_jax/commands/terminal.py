@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -47,6 +48,22 @@ def tell(text: str) -> None:
         print(visible(text), file=sys.stderr, flush=True)
     except OSError:  # `2>&1 | head`, a log on a full disk, a terminal that was closed
         silence(sys.stderr)
+
+
+def _forgiving(stream: Any) -> Any:
+    """A stream, for rich to draw on, that may come to lead nowhere: as in `tell`."""
+
+    def forgive(do: Callable[..., Any]) -> Callable[..., Any]:
+        def done(*given: Any) -> Any:
+            try:
+                return do(*given)
+            except OSError:
+                silence(stream)
+
+        return done
+
+    kept = {name: getattr(stream, name) for name in ("isatty", "fileno", "encoding")}
+    return SimpleNamespace(write=forgive(stream.write), flush=forgive(stream.flush), **kept)
 
 
 def silence(stream: Any) -> None:
@@ -141,7 +158,7 @@ def bar(total: int) -> Iterator[Callable[[str], None]]:
         TimeRemainingColumn(),
     )
     began, done = time.monotonic(), 0
-    with Progress(*columns, console=Console(stderr=True)) as shown:
+    with Progress(*columns, console=Console(file=_forgiving(sys.stderr))) as shown:
         task = shown.add_task("reading, compiling", total=total, rate="")
 
         def advance(name: str) -> None:

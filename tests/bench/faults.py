@@ -69,10 +69,11 @@ def kill(place: Place) -> Iterator[Row]:
 
 
 def signals(place: Place) -> Iterator[Row]:
+    heard = lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)  # noqa: E731 (this one may run under nohup)
     for name, number in (("SIGTERM", 15), ("Ctrl-C", 2), ("SIGHUP, the terminal closed", 1)):
         for frame in (2, 12):
             out = place.folder / f"{number}-{frame}"
-            process = stopped_after(place, frame, denoise(place, out))
+            process = stopped_after(place, frame, denoise(place, out), preexec_fn=heard)
             process.send_signal(number)
             code, said = go_on(process)
             words = ("interrupted", "Continue with", "--resume") if number != 1 else ()

@@ -20,7 +20,7 @@ import svgf_jax
 
 ROOT = Path(svgf_jax.__file__).parents[1]
 FRAMES = 24
-MADE = ("--png", "--video", "--checkpoint-every", "3")
+MADE = ("--png", "--video")
 
 
 class Place(NamedTuple):
@@ -57,7 +57,8 @@ def call(*arguments: object) -> list[str]:
 
 
 def denoise(place: Place, out: Path, *options: object) -> list[str]:
-    return call("denoise", place.shot, "-o", out, *MADE, *options)
+    often = () if "--checkpoint-every" in options else ("--checkpoint-every", 3)
+    return call("denoise", place.shot, "-o", out, *MADE, *often, *options)
 
 
 def start(place: Place, command: list[str], **options) -> subprocess.Popen:
