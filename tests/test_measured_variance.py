@@ -10,7 +10,7 @@ import shots
 from bridge import relative_error, to_config, to_frame, to_params
 
 from svgf_jax import exr, moments
-from svgf_jax.accumulation import accumulate
+from svgf_jax.accumulation import accumulate, clamp_history
 from svgf_jax.color import demodulate
 from svgf_jax.frames import load_sequence, open_source, read_frame
 from svgf_jax.pipeline import init
@@ -148,6 +148,24 @@ def test_measured_variances_against_plain_loops(estimator):
     assert ((length > 0) & (length < 4 - 1e-3)).any()
     assert relative_error(accumulated.moments, second).max() < 1e-9
     assert relative_error(got, variance, size=second[..., 1].max()).max() < 1e-9
+
+
+def test_a_nearly_black_radiance_makes_no_infinite_variance():
+    """The deviation is demodulated as the luminance was, by a factor of 2**30 at most."""
+    frame = to_frame(scenes.flat(1, 2, radiance=1e-12) | {"variance": np.full((1, 1, 2), 4.0)})
+    nothing = Reprojected(np.zeros((1, 1, 2, 3)), np.zeros((1, 1, 2, 2)), np.zeros((1, 2)), np.zeros((1, 2), bool))
+    got = accumulate(np.full((1, 1, 2, 3), 1.0), nothing, frame, params=to_params(oracle.PAPER))
+    np.testing.assert_allclose(got.moments[0, 0, :, 1], 1.0 + 4.0 * 2.0**60, rtol=1e-12)
+
+
+def test_where_there_is_no_history_the_clamp_leaves_nothing():
+    frame = to_frame(scenes.flat(3, 4))
+    valid = np.arange(12).reshape(3, 4) % 3 > 0
+    past = Reprojected(np.zeros((1, 3, 4, 3)), np.zeros((1, 3, 4, 2)), np.zeros((3, 4)), valid)
+    config = to_config({"clamp_radius": 1})
+    light = np.full((1, 3, 4, 3), 2.0)
+    got = clamp_history(past, light, frame, params=to_params(oracle.PAPER), config=config, strip_rows=None)
+    np.testing.assert_allclose(got.illumination[0, ..., 0], np.where(valid, 2.0, 0.0))
 
 
 SAMPLES, FRAMES = 4, 6

@@ -54,3 +54,27 @@ def test_unrolled_taps_add_up_to_the_same(monkeypatch):
     for fast, slow in zip(value_and_slope(), looped, strict=True):
         assert np.abs(slow).max() > 0.1
         np.testing.assert_allclose(fast, slow, rtol=1e-12, atol=1e-14)
+
+
+def test_reading_outside_gives_the_nearest_pixel_and_says_so():
+    plane = np.arange(12.0).reshape(3, 4)
+    row, column = np.array([0, -1, -9, 2, 3, 99, 1, 1, 1]), np.array([0, 0, -1, 3, 3, 4, -5, 4, 99])
+    values, inside = sampling.read_at(jnp.asarray(plane), jnp.asarray(row), jnp.asarray(column))
+    np.testing.assert_array_equal(inside, [True, False, False, True, False, False, False, False, False])
+    np.testing.assert_array_equal(values, plane[np.clip(row, 0, 2), np.clip(column, 0, 3)])
+
+
+def test_a_strip_that_nobody_asks_for_is_zero():
+    where = np.zeros((9, 3), bool)
+    where[4, 1] = True
+    total = sampling.sum_over_taps(
+        lambda sums, q, p, t: sums + q,
+        lambda sums, p: sums + p,
+        neighbours=jnp.ones((9, 3)),
+        centre=jnp.ones((9, 3)),
+        offsets=sampling.square_offsets(1),
+        sums=jnp.zeros(()),
+        where=jnp.asarray(where),
+        strip_rows=3,
+    )
+    np.testing.assert_array_equal(total, np.repeat([[0.0] * 3, [7.0, 10.0, 7.0], [0.0] * 3], 3, axis=0))

@@ -50,6 +50,8 @@ TESTS = {
         f"{STAGES}accumulate",
         "tests/test_reflections.py::test_a_history",
         "tests/test_measured_variance.py::test_measured_variances_against",
+        "tests/test_measured_variance.py::test_where",
+        "tests/test_measured_variance.py::test_a_nearly",
     ],
     "variance": [
         f"{STAGES}estimate_variance",
@@ -58,7 +60,7 @@ TESTS = {
     ],
     "atrous": [f"{STAGES}atrous", f"{STAGES}feedback", f"{STAGES}the_plain", f"{STAGES}backs"],
 }
-# Asked last: the whole.
+# Asked of all, last: the whole.
 LAST = [f"{STAGES}step", "tests/test_outliers.py::test_remove"]
 OTHER = {"maximum": "minimum", "minimum": "maximum", "floor": "ceil", "any": "all", "all": "any"}
 OTHER |= {"zeros_like": "ones_like", "ones_like": "zeros_like", "zeros": "ones", "exp": "abs"}
