@@ -3,9 +3,14 @@
 
 def main() -> None:
     """Run the command line."""
+    import contextlib
+    import faulthandler
+
     from svgf_jax import prints
     from svgf_jax.cli import main as cli_main
 
+    with contextlib.suppress(OSError, AttributeError, ValueError):  # a closed standard error
+        faulthandler.enable()  # what the EXR or the video library breaks does not end in silence
     prints.set_results_apart()
     cli_main()
 

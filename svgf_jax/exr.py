@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from svgf_jax import atomic, limits, prints
-from svgf_jax.exr_chunks import check_chunks, check_size
+from svgf_jax.exr_chunks import check_chunks, check_size, check_tiles
 from svgf_jax.exr_layout import Layout, Part, PathName, Window, read_layout
 from svgf_jax.types import SvgfError
 
@@ -190,6 +190,7 @@ def _opened(path: str, max_pixels: int | None) -> Iterator[tuple[BinaryIO, Layou
             layout = read_layout(file, path, os.fstat(file.fileno()).st_size)
             most, chosen = limits.max_pixels() if max_pixels is None else (max_pixels, True)
             _check_parts(path, layout.parts, most)
+            check_tiles(path, layout)
             if not chosen:
                 check_size(path, layout)
             yield file, layout

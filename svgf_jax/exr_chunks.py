@@ -21,15 +21,28 @@ LARGEST = 2**28
 
 def check_size(path: str, layout: Layout) -> None:
     """Raise SvgfError where a file claims more pixels than its bytes can hold, before they are allocated."""
-    claimed = sum(
-        part.size[0] * part.size[1] * sum(channel.dtype.itemsize for channel in part.channels.values())
-        for part in layout.parts
-    )
+    claimed = sum(part.size[0] * part.size[1] * _pixel_bytes(part) for part in layout.parts)
     if claimed > LARGEST and claimed > PLAUSIBLE * layout.bytes:
         raise SvgfError(
             f"{path}: {claimed / 1e9:.2g} GB of pixels in a file of {layout.bytes} bytes. Render or copy this frame again; if "
             f"it is all of one colour, say so by --max-pixels {layout.parts[0].size[0] * layout.parts[0].size[1]}."
         )
+
+
+def check_tiles(path: str, layout: Layout) -> None:
+    """Raise SvgfError for tiles far larger than their picture: the library keeps room for whole ones."""
+    for part in layout.parts:
+        if part.tiles is not None:
+            largest = max(LARGEST, part.size[0] * part.size[1] * _pixel_bytes(part))
+            if part.tiles.width * part.tiles.height * _pixel_bytes(part) > largest:
+                raise SvgfError(
+                    f"{path}: tiles of {part.tiles.width} x {part.tiles.height} in a picture of {part.size[0]} x "
+                    f"{part.size[1]}; the header is damaged. Render or copy this frame again."
+                )
+
+
+def _pixel_bytes(part: Part) -> int:
+    return sum(channel.dtype.itemsize for channel in part.channels.values())
 
 
 def check_chunks(file: BinaryIO, path: str, layout: Layout) -> None:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from svgf_jax.edges import depth_gradient, geometry_exponent, guides_of
-from svgf_jax.sampling import BY_WIDTH, in_strips, planes, square_offsets, sum_over_taps
+from svgf_jax.sampling import BY_WIDTH, add_up, in_strips, planes, square_offsets, sum_over_taps
 from svgf_jax.types import Config, Frame, Params, at_level
 
 SHORT_HISTORY = 4 - 1e-3  # history length is a real number: a mean of threes and fives must not be decided by rounding
@@ -31,7 +31,8 @@ def estimate_variance(
     max(1, short_history_boost / h). Strips of the image in which no pixel needs it are skipped.
 
     Where the frame brings measured variances, M2 - M1^2 is their mean over time from the first frame on: the spatial estimate is
-    then the weighted mean of the neighbours' M2 - M1^2, without a boost, and "temporal" needs no initial value.
+    then the weighted mean of the neighbours' M2 - M1^2, without a boost, and "temporal" needs no initial value. A frame that brings
+    none that is known counts as one that brings none.
 
     Args:
         moments: `[S, H, W, 2]`, accumulated M1 and M2 of the luminance.
@@ -53,9 +54,11 @@ def estimate_variance(
     short = surface & ((history_length < SHORT_HISTORY) | (config.variance == "spatial"))
     slope = depth_gradient(frame.depth, frame.object_id)
     signals = own = tuple(planes(signal) for signal in moments)
-    if measured is not None:  # the neighbours' variances themselves are averaged: the spread of their means is no noise
-        guides = guides._replace(surface=guides.surface * measured.astype(frame.depth.dtype))
-        signals = tuple((jnp.zeros_like(m1), _variance(m1, m2)) for m1, m2 in own)
+    known = None if measured is None else add_up(measured) > 0
+    if measured is not None and known is not None:
+        # The neighbours' variances themselves are averaged: the spread of their means is no noise.
+        guides = guides._replace(surface=guides.surface * (measured | ~known).astype(frame.depth.dtype))
+        signals = tuple((jnp.where(known, 0.0, m1), jnp.where(known, _variance(m1, m2), m2)) for m1, m2 in own)
     offsets = square_offsets(_RADIUS)
     steps = offsets.astype(frame.depth.dtype)
 
@@ -103,7 +106,8 @@ def estimate_variance(
     )
 
     def choose(around, signals, length, short, surface):
-        boost = jnp.maximum(1.0, scalars.short_history_boost / jnp.maximum(length, 1.0)) if measured is None else 1.0
+        boost = jnp.maximum(1.0, scalars.short_history_boost / jnp.maximum(length, 1.0))
+        boost = boost if known is None else jnp.where(known, 1.0, boost)
         chosen = (jnp.where(short, v * boost, _variance(m1, m2)) for v, (m1, m2) in zip(around, signals, strict=True))
         return tuple(jnp.where(surface, v, 0.0) for v in chosen)
 

@@ -243,7 +243,8 @@ def dissect(raw: bytes) -> Anatomy:
         head = 4 * (multi + (4 if tiled else 1) + 1)
         own = []
         for offset in struct.unpack_from(f"<{count}Q", raw, start):
-            own.append((offset, head, struct.unpack_from("<i", raw, offset + head - 4)[0]))
+            inside = offset + head <= len(raw)
+            own.append((offset, head, struct.unpack_from("<i", raw, offset + head - 4)[0] if inside else -1))
         chunks.append(own)
     return Anatomy(attributes, tables, chunks, multi)
 

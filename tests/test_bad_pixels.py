@@ -1,6 +1,6 @@
 """Bad pixels: whatever is in a frame, the output is finite and within bounds, repairs are counted, and the history recovers.
 
-More of them, for all presets, and gradients: bench/bad_pixels.py.
+More of them, for all presets, and gradients: bench/spoil_pixels.py.
 """
 
 import bad_pixels
@@ -21,7 +21,7 @@ ALPHA = 0.2
 @pytest.fixture(scope="module")
 def run():
     """The preset `paper` over a sequence with a leading T: the outputs; one compilation for all tests here."""
-    step, params = bridge.jitted_step(Config(), bridge.QUICK), bridge.to_params({}, np.float32)
+    step, params = bridge.jitted_step(Config()), bridge.to_params({}, np.float32)
 
     def over(frames: Frame):
         first, *_ = each = [jax.tree.map(lambda a, t=t: a[t], frames) for t in range(len(frames.depth))]

@@ -116,6 +116,7 @@ def with_attribute(raw, name, value) -> bytes:
         ("tiles", struct.pack("<IIB", 0, 8, 0), "damaged .*tiles of 0 x 8"),
         ("tiles", struct.pack("<IIB", 8, 2**31, 0), "damaged .*tiles of 8 x 2147483648"),
         ("tiles", struct.pack("<IIB", 8, 8, 7), "damaged .*mode 7"),
+        ("tiles", struct.pack("<IIB", 2**20, 2**20, 0), "1 make the picture"),
         ("tiles", struct.pack("<IIB", 4, 8, 0), "[0-9]+ chunks; [0-9]+ make the picture"),
         ("compression", b"\xc8", "compression number 200"),
         ("type", b"hologram!!", "a part of type 'hologram!!'"),
@@ -131,6 +132,11 @@ def test_numbers_of_a_header_that_do_not_hold_together_are_refused(put, name, va
         exr.read_header(path)
 
 
+def test_tiles_far_larger_than_their_picture_are_refused(put):
+    refused(claim(put, 21, 17, 900, tile=(2**20, 2**12)), "tiles of 1048576 x 4096 in a picture of 21 x 17")
+    assert exr.read_header(claim(put, 21, 17, 900, tile=(2**12, 2**12))).channels
+
+
 @pytest.mark.parametrize("size", [-1, 2**31 - 1, 3])
 def test_an_attribute_of_another_size_is_refused(put, size):
     raw = exr_files.write([part()])
@@ -138,12 +144,12 @@ def test_an_attribute_of_another_size_is_refused(put, size):
     refused(put(put_at(raw, at - 4, "<i", size)), "header is damaged")
 
 
-def claim(put, width, height, size, compression=9) -> Path:
-    """A file of one tile that is as large as the picture that it claims."""
+def claim(put, width, height, size, compression=9, tile=None) -> Path:
+    """A file of one tile that is as large as the picture that it claims, or as it is said to be."""
     raw = exr_files.write([part(pixels={"Z": np.zeros(SHAPE, "<f4")}, tile=(32, 32))])
     for name, value in {
         "dataWindow": struct.pack("<4i", 0, 0, width - 1, height - 1),
-        "tiles": struct.pack("<IIB", width, height, 0),
+        "tiles": struct.pack("<IIB", *(tile or (width, height)), 0),
         "compression": bytes([compression]),
     }.items():
         raw = with_attribute(raw, name, value)
@@ -231,6 +237,17 @@ def test_c_code_prints_beside_the_results():
     script = "import os; from svgf_jax import prints; prints.set_results_apart(); os.write(1, b'C'); print('result é')"
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True)
     assert (ran.stdout.decode(), ran.stderr) == ("result é\n", b"C")
+
+
+def test_a_crash_of_a_library_is_told():
+    script = (
+        "import ctypes, contextlib, sys; sys.argv = ['svgf-jax', '--version']; from svgf_jax.__main__ import main\n"
+        "with contextlib.suppress(SystemExit): main()\n"
+        "ctypes.string_at(0)"
+    )
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert ran.returncode < 0
+    assert "Segmentation fault" in ran.stderr
 
 
 def test_max_pixels_on_the_command_line(put, capsys):

@@ -131,6 +131,27 @@ def window_mean(own, counts, at, depth, normal, gradient, params):
     return total / weights if weights > 1e-15 else own[:, y, x]
 
 
+@pytest.mark.parametrize("estimator", ["svgf", "spatial"])
+def test_a_frame_whose_variance_is_nowhere_known_counts_as_one_without(estimator):
+    rng = np.random.default_rng(4)
+    frame, _ = sanitise(to_frame(scenes.synthetic(5, *SIZE, frames=1)[0]))
+    first = jnp.asarray(rng.gamma(1.0, 1.0, (2, *SIZE)))
+    pairs = jnp.stack([first, first**2 + rng.gamma(1.0, 1.0, (2, *SIZE))], axis=-1)
+    length = jnp.asarray(rng.uniform(1, 6, SIZE))
+    estimate = jax.jit(
+        lambda frame: estimate_variance(
+            pairs,
+            length,
+            frame,
+            params=to_params({"short_history_boost": 4.0}),
+            config=to_config({"variance": estimator}),
+        )
+    )
+    unknown = frame._replace(variance=jnp.full((2, *SIZE), -1.0))
+    np.testing.assert_allclose(estimate(unknown), estimate(frame), rtol=1e-12)
+    assert estimate(frame)[:, frame.object_id != -1].min() > 0
+
+
 @pytest.mark.parametrize("estimator", ["svgf", "spatial", "temporal"])
 def test_measured_variances_against_plain_loops(estimator):
     raw, light, previous, params, second, length, variance = measured_case(estimator)

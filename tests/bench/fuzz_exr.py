@@ -14,7 +14,7 @@ on its memory (2 GB) and on its time; it is started anew when it dies. What coun
   decode (counted as "told"), control characters;
 - wrong: a read that succeeds although the file is cut off; with another shape, name or type than the header says; with other
   pixels than a plain reader (struct and zlib alone: tests/exr_files.py) finds, where it knows the compression; or with
-  other pixels than before the damage, where neither pixel data nor what the header says of them was touched.
+  other pixels than before the damage, where neither pixel data, nor their size, nor what the header says of them was touched.
 
 What nobody can notice: flipped pixels of a file without checksums that is a valid file still. Needs hypothesis.
 """
@@ -325,9 +325,18 @@ def _said(raw: bytes) -> Any:
 
 
 def _payload(raw: bytes, base: Base) -> bool:
-    """Whether all bytes of pixel data are where they were, as they were."""
-    places = [(offset + head, size) for part in base.anatomy.chunks for offset, head, size in part]
+    """Whether all bytes of pixel data, and their number, are where they were, as they were."""
+    places = [(offset + head - 4, size + 4) for part in base.anatomy.chunks for offset, head, size in part]
     return len(raw) == len(base.raw) and all(raw[at : at + n] == base.raw[at : at + n] for at, n in places)
+
+
+def keep(folder: Path | None, finding: tuple[str, str, str, bytes], number: int) -> None:
+    where, verdict, why, raw = finding
+    print(f"{verdict}: {where}: {why[:300]}", flush=True)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        safe = "".join(c if c.isalnum() else "-" for c in where)[:80]
+        (folder / f"{verdict}-{number}-{safe}.exr").write_bytes(raw)
 
 
 def main() -> None:
@@ -351,6 +360,7 @@ def main() -> None:
             verdict, why = judge(base.raw, base, path, answer)
             if verdict not in ("right", "refused"):
                 findings.append((f"whole file {base.name}", verdict, why, base.raw))
+                keep(options.keep, findings[-1], len(findings))
             pixels = None
             if "channels" in answer.get("read", {}):
                 pixels = tuple(sorted(digest for *_, digest in answer["read"]["channels"].values()))
@@ -373,18 +383,13 @@ def main() -> None:
             told += answer.get("told", False)
             if verdict not in ("right", "refused"):
                 findings.append((f"{options.seed}/{i} {base.name} {how}", verdict, why, raw))
+                keep(options.keep, findings[-1], len(findings))
             if (i + 1) % 2000 == 0:
                 print(f"{i + 1}: {dict(verdicts)}, {time.monotonic() - began:.0f} s", flush=True)
         worker.process.kill()
         if odd := re.findall(rb".{0,80}[\x00-\x09\x0b-\x1f\x7f].{0,80}", (folder / "log").read_bytes()):
             findings.append(("the standard error", "printed", repr(odd[:3]), b""))
-        for where, verdict, why, _ in findings[:200]:
-            print(f"{verdict}: {where}: {why[:300]}")
-        if options.keep:
-            options.keep.mkdir(parents=True, exist_ok=True)
-            for n, (where, verdict, _, raw) in enumerate(findings):
-                safe = "".join(c if c.isalnum() else "-" for c in where)[:80]
-                (options.keep / f"{verdict}-{n}-{safe}.exr").write_bytes(raw)
+            keep(options.keep, findings[-1], len(findings))
     counted = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
     print(
         f"{options.files} files, seed {options.seed}: {counted}; told {told}; at most {growth / 2**20:.0f} MB for a file, ",
