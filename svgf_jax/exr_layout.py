@@ -225,13 +225,16 @@ def _tiles(raw: bytes) -> Tiles:
 
 def _channels(raw: bytes) -> dict[str, Channel]:
     channels = {}
-    at = 0
+    at, before = 0, b""
     while raw[at] != 0:
         end = raw.index(0, at)
         pixel_type, _, x, y = struct.unpack_from("<iiii", raw, end + 1)
         name = _text(raw[at:end])
-        if name in channels or not (x > 0 and y > 0) or pixel_type not in _PIXEL_TYPES:
-            raise ValueError(f"channel {name!r} of type {pixel_type}, sampled at {x} x {y}, or twice there")
+        if not (x > 0 and y > 0) or pixel_type not in _PIXEL_TYPES:
+            raise ValueError(f"channel {name!r} of type {pixel_type}, sampled at {x} x {y}")
+        if raw[at:end] <= before:  # the library would sort the names, and leave the pixels as they lie
+            raise ValueError(f"channel {name!r} out of alphabetical order or twice there")
+        before = raw[at:end]
         channels[name] = Channel(_PIXEL_TYPES[pixel_type], (x, y))
         at = end + 17
     if not channels:

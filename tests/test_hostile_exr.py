@@ -199,9 +199,11 @@ def test_names_with_markup_come_as_they_are(put):
     assert set(image.channels) == set(names)
 
 
-def test_a_channel_that_is_there_twice_is_refused(put):
-    raw = exr_files.write([part(pixels={"Ra": np.zeros(SHAPE, "<f4"), "Rb": np.zeros(SHAPE, "<f4")})])
-    refused(put(raw.replace(b"Rb\0", b"Ra\0", 1)), "'Ra' .* twice there")
+def test_channels_out_of_order_or_twice_there_are_refused(put):
+    """The library gives one the pixels of the other."""
+    raw = exr_files.write([part(pixels={"Rb": np.zeros(SHAPE, "<f4"), "Rc": np.ones(SHAPE, "<f4")})])
+    for other in b"Rb\0", b"Ra\0":
+        refused(put(raw.replace(b"Rc\0", other, 1)), "'R[ab]' out of alphabetical order or twice there")
 
 
 def corrupt(raw) -> bytes:
