@@ -33,6 +33,10 @@ Identity = dict[
 ]  # JSON: whatever two runs must share to be the same run; its "frames" lists the inputs in order
 
 
+class Busy(SvgfError):
+    """Another run holds the folder."""
+
+
 class Checkpoint(NamedTuple):
     """The state between two frames: the next frame's index, and the history (None = no past) as NumPy arrays."""
 
@@ -55,6 +59,24 @@ def lock(state: Path) -> Iterator[Callable[[], None]]:
     """
     with _held(state.parent, shared=True) if state.name != FOLDER else contextlib.nullcontext(), _held(state) as still:
         yield still
+
+
+def is_held(state: Path) -> bool:
+    """Whether a run holds a state folder now."""
+    try:
+        file = open(state / "lock", "a+")  # noqa: SIM115 (closed below)
+    except OSError:
+        return False
+    with file:
+        return not _try_lock(file, shared=True)
+
+
+def holder(state: Path) -> str:
+    """`process 12 on node3`: who holds a state folder, or held it last; "" if nobody ever did."""
+    try:
+        return (state / "lock").read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError):
+        return ""
 
 
 @contextmanager
@@ -93,7 +115,7 @@ def _locked(path: Path, *, shared: bool) -> TextIO:
             with file:
                 file.seek(0)
                 holder = file.read().strip() or "parts of the sequence"
-            raise SvgfError(
+            raise Busy(
                 f"Another run is writing into {_folder(path.parent)} ({holder}). "
                 "Wait for it to end, or choose another output folder."
             )

@@ -10,7 +10,7 @@ FLOORS = [
     {"atomic", "memory", "prints", "remedies"},
     {"types"},
     {"limits", "tonemapping", "toml"},
-    {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments", "motion"},
+    {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments", "motion", "processes"},
     {"windows", "noise", "exr_chunks"},
     {
         "methods",

@@ -59,6 +59,7 @@ def test_help_and_errors_answer_without_jax(tmp_path):
         (["a", "b", "--reference", "r", "-o", "t.toml"], "2 sequences and 1 of --reference"),
         (["a", "--reference", "r", "-o", "nowhere/t.toml"], "no folder"),
         (["a", "--second", "r", "--robust", "huber", "-o", "t.toml"], "biased"),
+        (["a", "--reference", "r", "--process", "1", "-o", "t.toml"], "without --distributed"),
         (["a", "--reference", "r", "--validate", "v", "-o", "t.toml"], "wanted one for each"),
         (["a", "--reference", "r", "-o", "t.toml"], "no such"),
     ],

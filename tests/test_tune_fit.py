@@ -13,7 +13,7 @@ from bridge import to_frames
 
 import tune
 from svgf_jax import Config, Frame, Params, SvgfError, denoise, tonemap
-from tune import checkpoint
+from tune import checkpoint, share
 from tune import solver as solvers
 from tune.free import choose, from_free, to_free
 from tune.residuals import (
@@ -360,3 +360,21 @@ def test_window_is_a_crop():
     np.testing.assert_array_equal(frame.depth, noisy.depth[1, 2:9, 3:15])
     np.testing.assert_array_equal(frame.motion, noisy.motion[1, 2:9, 3:15])
     np.testing.assert_array_equal(wanted, target[1, 2:9, 3:15])
+
+
+def test_sequences_of_several_processes_fold_into_what_one_finds():
+    posed = problem(shots=[shot(), shot(seed=4), shot(seed=5)])
+    y = posed.y_start + 0.1
+    whole, packed = sweep(posed, y, linear=True), []
+
+    def keep(found, bound):
+        packed.append(share._packed(found))
+        return found
+
+    parts = [sweep(posed._replace(share=share.Share(index, 2, keep)), y, linear=True) for index in range(2)]
+    assert [np.count_nonzero(part.shot_losses) for part in parts] == [2, 1]
+    merged = share._merged(parts[0], packed, np.inf)
+    for name, value in whole._asdict().items():
+        np.testing.assert_allclose(getattr(merged, name), value, rtol=1e-9, atol=1e-12, err_msg=name)
+    assert not share._merged(parts[1], packed, 0.5 * whole.loss).complete
+    assert share._merged(sweep(posed, y, linear=False), packed, np.inf).triangle is None

@@ -3,7 +3,7 @@
 import dataclasses
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,6 +13,7 @@ from svgf_jax import SvgfError
 from svgf_jax.commands import settings, terminal
 from svgf_jax.commands.completing import PRESET
 from svgf_jax.commands.settings import INPUT, Flag, Reading
+from svgf_jax.processes import Process, check_meeting, leave, meet
 
 if TYPE_CHECKING:
     from tune.fitting import Fit
@@ -55,6 +56,10 @@ def command(
     seed: Annotated[int, Parameter(metavar="N", group=HOW)] = 0,
     tangent_batch: Annotated[int, Parameter(metavar="N", group=HOW)] = 8,
     resume: Annotated[bool, Flag, Parameter(group=HOW)] = False,
+    distributed: Annotated[bool, Flag, Parameter(group=HOW)] = False,
+    coordinator: Annotated[str | None, Parameter(metavar="HOST:PORT", group=HOW)] = None,
+    processes: Annotated[int | None, Parameter(metavar="N", group=HOW)] = None,
+    process: Annotated[int | None, Parameter(metavar="I", group=HOW)] = None,
     report: Annotated[Path | None, Parameter(metavar="FILE.html", group=OUTPUT)] = None,
     maps: Annotated[Path | None, Parameter(metavar="FOLDER", group=OUTPUT)] = None,
     profiles: Annotated[bool, Flag, Parameter(group=OUTPUT)] = False,
@@ -91,6 +96,10 @@ def command(
         seed: Of the scattered starts.
         tangent_batch: Derivatives taken at a time: fewer need less memory and more time.
         resume: Go on where an interrupted fit of the same options was.
+        distributed: Share the sequences with the other processes of this job: of Slurm, Kubernetes or MPI, or by hand.
+        coordinator: By hand: where process 0 is to be reached.
+        processes: By hand: how many there are.
+        process: By hand: which this is, from 0 on.
         report: Write a page with curves, tables and pictures.
         maps: Write where in the image each number matters, as EXR.
         profiles: Measure the error along each parameter by itself, and tell it with --json and --report.
@@ -115,6 +124,7 @@ def command(
         raise SvgfError(f"{checkpoint}: no checkpoint to resume from; start without --resume.")
     if maps is not None and maps.exists() and not maps.is_dir():
         raise SvgfError(f"--maps {maps} is a file; wanted a folder.")
+    check_meeting(distributed, coordinator, processes, process)
     opened = reading.options()
     if flip:
         from svgf_jax.metrics import require_flip
@@ -126,6 +136,7 @@ def command(
     from tune import residuals
     from tune.fitting import fit
     from tune.free import TUNED_BY_DEFAULT, choose
+    from tune.share import share_with
     from tune.shots import shot_of_files
     from tune.targets import with_doubts
     from tune.telling import conclude, live, versions
@@ -163,9 +174,19 @@ def command(
         "files": [stamp(path) for shot in shots for path in shot.paths],
         "versions": versions(),
     }
+    nobody: Any = lambda heard: None  # noqa: E731
     terminal.warn(dict.fromkeys(note for shot in (*references, *seconds, *held) for note in shot.notes))
     length = sum(shot.length for shot in shots)
-    with _terminated_as_interrupted(), live(len(shots), length, labels) as on_iteration:
+    me = Process()
+    with _terminated_as_interrupted(), ExitStack() as stack:
+        if distributed:
+            me = meet(coordinator, processes, process)
+            stack.callback(leave, me)
+        if len(shots) < me.size:
+            raise SvgfError(
+                f"Got {terminal.count(len(shots), 'sequence')} for {me.size} processes; wanted at least one each. Start fewer."
+            )
+        on_iteration = nobody if me.rank else stack.enter_context(live(len(shots), length, labels))
         found = fit(
             start,
             config,
@@ -179,10 +200,13 @@ def command(
             starts=starts,
             seed=seed,
             tangent_batch=tangent_batch,
+            share=share_with(me) if distributed else None,
             on_iteration=on_iteration,
-            save=lambda progress: checkpoints.save(checkpoint, progress, identity),
+            save=nobody if me.rank else lambda progress: checkpoints.save(checkpoint, progress, identity),
             resume=(lambda fresh: checkpoints.load(checkpoint, fresh, identity)) if resume else None,
         )
+    if me.rank:  # process 0 tells and writes
+        return 130 if _interrupted(found) else 0
     code = conclude(
         found,
         start,

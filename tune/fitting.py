@@ -10,6 +10,7 @@ from tune import solver as solvers
 from tune.free import TUNED_BY_DEFAULT, Coordinates, choose, natural, params_at, to_free
 from tune.knowledge import Knowledge, learn
 from tune.residuals import REFERENCE, Term
+from tune.share import Share
 from tune.shots import Shot
 from tune.sweep import Problem, Sweep, pose, pull, sweep
 
@@ -113,6 +114,7 @@ def fit(
     seed: int = 0,
     tangent_batch: int = 8,
     balance: bool = True,
+    share: Share | None = None,
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
     save: Callable[[Progress], None] = lambda progress: None,
     resume: Callable[[solvers.Descent], Progress] | None = None,
@@ -131,6 +133,7 @@ def fit(
         starts: the first is `params`; each other is some way off, in all free coordinates, drawn from `seed`.
         tangent_batch: derivatives taken at a time: fewer need less memory and more time, for the same result.
         balance: each shot counts alike, whatever its error at the start.
+        share: this process's part, where several fit together; see `tune.share`.
         on_iteration: hears of each trial point.
         save: hears of each state in which the fit could go on later; `resume`: given a fresh descent, such a state.
 
@@ -146,7 +149,7 @@ def fit(
     y_start = to_free(coordinates.start, coordinates)
     chosen = solvers.make_solver(solver) if isinstance(solver, str) else solver
     fresh = solvers.begin(chosen, y_start)
-    problem = pose(coordinates, y_start, residuals, shots, tangent_batch=tangent_batch, balance=balance)
+    problem = pose(coordinates, y_start, residuals, shots, tangent_batch=tangent_batch, balance=balance, share=share)
     if resume is not None:
         progress = resume(fresh)
         problem = problem._replace(pixel_weights=progress.pixel_weights)

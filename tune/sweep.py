@@ -18,6 +18,7 @@ from svgf_jax.threads import read_ahead
 from tune.fold import combine, factor_blocks
 from tune.free import GATES, Coordinates
 from tune.residuals import Term
+from tune.share import Share
 from tune.shots import Example, Shot
 from tune.tangents import Carry, FramePass, Given, Smooth, compile_pass, no_tangents
 
@@ -39,6 +40,7 @@ class Problem(NamedTuple):
         pixel_weights: factor on each shot's error in the terms that look at pixels.
         tangent_batch: directions differentiated at a time.
         frame_pass: the compiled functions.
+        share: which of the shots this process runs, and what tells it of the others; None = all.
     """
 
     coordinates: Coordinates
@@ -48,6 +50,7 @@ class Problem(NamedTuple):
     pixel_weights: np.ndarray
     tangent_batch: int
     frame_pass: FramePass
+    share: Share | None = None
 
 
 class Sweep(NamedTuple):
@@ -78,6 +81,7 @@ def pose(
     *,
     tangent_batch: int = 8,
     balance: bool = True,
+    share: Share | None = None,
 ) -> Problem:
     """The problem, its terms scaled so that those that look at pixels are 1 together at the start.
 
@@ -90,7 +94,9 @@ def pose(
     if not any(term.pixels for term in terms):
         raise SvgfError("got no residual that looks at pixels; wanted at least one with a weight above 0")
     frame_pass = compile_pass(coordinates.free, coordinates.config, terms)
-    problem = Problem(coordinates, y_start, terms, tuple(shots), np.ones(len(shots)), max(1, tangent_batch), frame_pass)
+    problem = Problem(
+        coordinates, y_start, terms, tuple(shots), np.ones(len(shots)), max(1, tangent_batch), frame_pass, share
+    )
     # The others are 0 at the start: the prior by definition.
     losses = sweep(problem, y_start, linear=False).shot_losses * len(shots)
     if not np.isfinite(losses).all() or (losses <= _NOTHING).any():
@@ -111,6 +117,8 @@ def sweep(problem: Problem, y: np.ndarray, *, linear: bool, bound: float = np.in
     complete = True
     with ThreadPoolExecutor(1, thread_name_prefix="svgf-fold") as folding:
         for i, shot in enumerate(problem.shots):
+            if problem.share is not None and i % problem.share.size != problem.share.rank:
+                continue
             before: Future | None = None
             with closing(frame_blocks(problem, i, shot, y, linear)) as blocks:
                 for block in blocks:
@@ -126,7 +134,10 @@ def sweep(problem: Problem, y: np.ndarray, *, linear: bool, bound: float = np.in
             if not complete or losses.sum() > bound:
                 complete = False
                 break
-    return Sweep(float(losses.sum()), losses, triangle if linear else None, scatter if linear else None, rows, complete)
+    found = Sweep(
+        float(losses.sum()), losses, triangle if linear else None, scatter if linear else None, rows, complete
+    )
+    return found if problem.share is None else problem.share.merge(found, bound)
 
 
 def pull(problem: Problem, y: np.ndarray) -> np.ndarray:

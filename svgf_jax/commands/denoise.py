@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
-from svgf_jax.commands import results, settings, terminal
+from svgf_jax.commands import results, settings, several, terminal
 from svgf_jax.commands.completing import PRESET
 from svgf_jax.commands.rehearsal import describe_input, rehearse
 from svgf_jax.commands.settings import INPUT, Flag, Reading, Repeated
+from svgf_jax.processes import check_meeting, leave, meet
 from svgf_jax.types import SvgfError
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ FILTER, OUTPUT, RUN = (Group(name, sort_key=i) for i, name in enumerate(["Filter
 
 
 def denoise(
-    input_: Annotated[str, Parameter(name="INPUT", group=INPUT)],
+    inputs: Annotated[tuple[str, ...], Parameter(name="INPUT", group=INPUT)],
     /,
     *,
     out: Annotated[Path, Parameter(name=["--out", "-o"], metavar="FOLDER", group=OUTPUT)],
@@ -56,6 +57,11 @@ def denoise(
     overwrite: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     resume: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     checkpoint_every: Annotated[int, Parameter(metavar="FRAMES", group=RUN)] = 8,
+    split: Annotated[int | None, Parameter(metavar="FRAMES", group=RUN)] = None,
+    distributed: Annotated[bool, Flag, Parameter(group=RUN)] = False,
+    coordinator: Annotated[str | None, Parameter(metavar="HOST:PORT", group=RUN)] = None,
+    processes: Annotated[int | None, Parameter(metavar="N", group=RUN)] = None,
+    process: Annotated[int | None, Parameter(metavar="I", group=RUN)] = None,
     dry_run: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     json: Annotated[bool, Flag, Parameter(group=RUN)] = False,
     verbose: Annotated[bool, Flag, Parameter(name=["--verbose", "-v"], group=RUN)] = False,
@@ -63,7 +69,7 @@ def denoise(
     """Denoise a sequence of EXR files into a folder, one file a frame under the input's name.
 
     Args:
-        input_: A folder, a pattern (frame_####.exr, frame_%04d.exr, frame_$F4.exr) or one file.
+        inputs: Folder, pattern (frame_####.exr, frame_%04d.exr, frame_$F4.exr) or file; of several, each gets a folder in --out.
         out: The output folder; made if it is not there.
         frames: Only these: 1-100, 1-100x2 or 1,3,5-9.
         missing: A missing frame is an error, repeats the output before it (hold), or starts the history anew (reset).
@@ -92,10 +98,21 @@ def denoise(
         overwrite: Replace outputs that exist.
         resume: Continue an interrupted run where its last checkpoint is; the result is the same bit for bit.
         checkpoint_every: Save the history for --resume after so many frames.
+        split: Cut each input into ranges of so many frames, each a run of its own that warms up (--warmup, 32 if not given).
+        distributed: Share the inputs and ranges with the other processes of this job: of Slurm, Kubernetes or MPI, or by hand.
+        coordinator: By hand: where process 0 is to be reached.
+        processes: By hand: how many there are.
+        process: By hand: which this is, from 0 on.
         dry_run: Check everything, tell what would be done and about what it would take, and write nothing.
         json: Print a summary as JSON to the standard output; all else goes to the standard error.
         verbose: Also tell what is not there, the parameters and the device.
     """
+    if not inputs:
+        raise SvgfError("Got no input; wanted a folder, a pattern or a file: svgf-jax denoise INPUT -o FOLDER.")
+    check_meeting(distributed, coordinator, processes, process)
+    if distributed or split is not None or len(inputs) > 1:
+        return _several(dict(locals()))
+    (input_,) = inputs
     changes = (*set_, "taa=true") if taa else set_
     chosen_preset, chosen, config = settings.choose_method(method, preset, params, changes)
     opened = reading.options()
@@ -183,6 +200,46 @@ def denoise(
         terminal.tell(f"interrupted; every file in {out} is complete. Continue with: svgf-jax {shlex.join(again)}")
         return 128 + interruption[0]
     return 0
+
+
+def _several(given: dict[str, Any]) -> int:
+    """`denoise` for each task of many; `given` are its arguments."""
+    (inputs, out, frames, warmup, split) = (given.pop(name) for name in ("inputs", "out", "frames", "warmup", "split"))
+    distributed, resume, overwrite = (given.pop(name) for name in ("distributed", "resume", "overwrite"))
+    meeting = [given.pop(name) for name in ("coordinator", "processes", "process")]
+    for name in ("report", "reference", "tev_address", "tev", "json"):
+        if given[name] not in (None, False):
+            raise SvgfError(
+                f"Got --{name.replace('_', '-')} for several runs; wanted one input, without --split and --distributed."
+            )
+    if distributed and overwrite:
+        raise SvgfError(
+            "Got --distributed and --overwrite; wanted an empty output folder, or one to go on in: a process could not tell what "
+            "another has just written from what is to be replaced."
+        )
+    settings.choose_method(given["method"], given["preset"], given["params"], given["set_"])
+    tasks = several.plan_tasks(
+        inputs, out, frames=frames, warmup=warmup, split=split, missing=given["missing"], **given["reading"].options()
+    )
+
+    def run(task: several.Task) -> int:
+        again = {"resume": resume or distributed, "overwrite": overwrite}
+        return denoise((task.shot,), out=task.out, frames=task.frames, warmup=task.warmup, **again, **given)
+
+    if given["dry_run"]:
+        return max([run(task) for task in tasks])
+    if not distributed:
+        return several.deal(tasks, run)
+    me = meet(*meeting)
+    try:
+        locks = several.locks_reach(out, me)
+    finally:
+        leave(me)
+    if not locks:
+        terminal.warn(
+            [f"{out}: locks do not reach from machine to machine there; nobody takes over what a process leaves"]
+        )
+    return several.deal(tasks, run, rank=me.rank, size=me.size, locks=locks)
 
 
 def _conclude(summary: "Summary", *, verbose: bool) -> None:
