@@ -76,9 +76,7 @@ def shot_names(shots: Sequence[str]) -> list[str]:
     )
 
 
-def deal(
-    tasks: Sequence[Task], run: Callable[[Task], int], *, rank: int = 0, size: int = 1, locks: bool = True
-) -> int:
+def deal(tasks: Sequence[Task], run: Callable[[Task], int], *, rank: int = 0, size: int = 1, locks: bool = True) -> int:
     """Run what this process of several should: the exit code.
 
     `locks`: whether those of one process are seen by all, so that it may take over what another left. Process 0 waits until all is
