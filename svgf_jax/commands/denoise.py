@@ -112,7 +112,7 @@ def denoise(
     check_meeting(distributed, coordinator, processes, process)
     if distributed or split is not None or len(inputs) > 1:
         return _several(dict(locals()))
-    input_ = inputs[0]
+    input_ = next(iter(inputs))
     changes = (*set_, "taa=true") if taa else set_
     chosen_preset, chosen, config = settings.choose_method(method, preset, params, changes)
     opened = reading.options()
