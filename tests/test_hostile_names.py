@@ -3,6 +3,7 @@
 import json
 import os
 
+import browser
 import numpy as np
 import pytest
 from shots import write_frame, write_shot
@@ -78,6 +79,16 @@ def test_what_steers_a_terminal_is_spelt_out(text, capsys):
     assert "\\" in shown
     assert not controls(shown)
     page.escape(text).encode()  # can be written
+
+
+def test_a_script_that_slipped_into_a_page_does_not_run(tmp_path):
+    file = tmp_path / "page.html"
+    evil = page.Raw("<script>document.title = 'evil'</script><img src=x onerror=\"document.title = 'evil'\">")
+    file.write_text(page.document("good", [page.table(("name",), [(evil,)])]))
+    with pytest.raises(AssertionError, match="Content Security Policy"):  # the browser says so, and `opened` tells
+        browser.opened(file, tmp_path, script="")
+    file.write_text(page.document("good", ["<p>nothing</p>"]))
+    assert "<title>good</title>" in browser.opened(file, tmp_path, script="document.body.dataset.ran = 1")
 
 
 def test_ordinary_names_stay_as_they_are():
