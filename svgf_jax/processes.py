@@ -5,6 +5,7 @@ once they have met, so that a process that dies takes none with it. Imports JAX 
 """
 
 import contextlib
+import os
 import time
 from typing import Any, NamedTuple
 
@@ -59,6 +60,7 @@ def meet(
     Raises SvgfError: nothing tells which process this is, or not all came `within` so many seconds.
     """
     check_meeting(True, coordinator, processes, process)
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # else the runtime warns of what is meant here
     import jax
     from jax._src.distributed import global_state as state  # nothing public tells this without making a backend
 

@@ -85,17 +85,19 @@ def deal(tasks: Sequence[Task], run: Callable[[Task], int], *, rank: int = 0, si
     from svgf_jax.checkpoint import Busy, is_held
 
     failed: dict[str, str] = {}
+    done_before = {task for task in tasks if _complete(task)}  # which their runs look at, and say so
     mine = list(tasks[rank::size])
     todo = mine + [task for task in tasks if task not in mine] if locks else mine
     first = True
     while todo:
         held = []
         for task in todo:
-            if (task not in mine or not first) and (_complete(task) or is_held(task.state)):
-                if not _complete(task):
-                    held.append(task)
+            if _complete(task) and not (task in mine and task in done_before):
                 continue
-            terminal.tell(f"[{rank + 1} of {size}] {task.name}" if size > 1 else task.name)
+            if (task not in mine or not first) and is_held(task.state):
+                held.append(task)
+                continue
+            terminal.tell(f"process {rank}: {task.name}" if size > 1 else task.name)
             try:
                 code = run(task)
             except Busy:
