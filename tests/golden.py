@@ -114,6 +114,8 @@ def main() -> int:
     options = parser.parse_args()
     if options.devices > 1:
         jax.config.update("jax_num_cpu_devices", options.devices)
+        if len(jax.devices()) < options.devices:
+            parser.error(f"there are only {len(jax.devices())} devices here")
     now = outputs(devices=options.devices)
     if options.write:
         KEPT.parent.mkdir(parents=True, exist_ok=True)
