@@ -40,7 +40,7 @@ def frames() -> svgf.Frame:
     return svgf.Frame(**{name: cut(name, array) for name, array in given.items()})
 
 
-def outputs(presets=PRESETS, *, devices: int = 1, compile_options: tuple = ()) -> dict[str, np.ndarray]:
+def outputs(presets=PRESETS, *, devices: int = 1) -> dict[str, np.ndarray]:
     """`preset.layer` -> the last frame's, of each preset. Presets of one configuration share what is compiled."""
     found, shot, steps = {}, frames(), {}
     for preset in presets:
@@ -51,7 +51,7 @@ def outputs(presets=PRESETS, *, devices: int = 1, compile_options: tuple = ()) -
             step = partial(svgf.step, config=config)
             if devices > 1:
                 step = partial(svgf.step_over, config=config, devices=jax.devices()[:devices])
-            steps[config] = jax.jit(step, compiler_options=dict(compile_options))
+            steps[config] = jax.jit(step)
         history, output = svgf.init(jax.tree.map(lambda a: a[0], shot), config=config), None
         for i in range(len(shot.depth)):
             history, output = steps[config](history, jax.tree.map(lambda a: a[i], shot), params=params)  # noqa: B023

@@ -1,6 +1,5 @@
 """Determinism: the golden set, and that nothing about how a run is organised changes a bit."""
 
-import bridge
 import golden
 import numpy as np
 import pytest
@@ -11,8 +10,8 @@ from svgf_jax.frames import open_source
 
 
 def test_what_presets_make_of_a_real_crop_stays_what_it_was():
-    """Compiled quickly, which differs by less than 2e-6. `adaptive` takes as long as these together: python tests/golden.py."""
-    lines, good = golden.compare(golden.outputs(("paper", "tuned", "falcor"), compile_options=bridge.QUICK))
+    """Compiled quickly, as all tests are: that differs by less than 2e-6. tests/golden.py itself does `adaptive` too."""
+    lines, good = golden.compare(golden.outputs(("paper", "tuned", "falcor")))
     assert good, "\n".join(lines)
 
 
