@@ -20,6 +20,7 @@ M1' = g M1 + o; the variance M2 - M1^2 scales with the square of the light and t
 Nothing here is in Schied et al. 2017; the gradient's normalisation is that of A-SVGF (Schied et al. 2018) in other clothes.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -30,18 +31,39 @@ from jax import Array, lax
 
 from svgf_jax.color import largest_luminance, luminance_of_planes
 from svgf_jax.edges import Guides, depth_gradient, geometry_exponent, guides_of
-from svgf_jax.sampling import add_margin, in_strips, planes, square_offsets, sum_over_taps
+from svgf_jax.sampling import (
+    Planes,
+    add_margin,
+    in_strips,
+    planes,
+    split_rows,
+    square_offsets,
+    stack_planes,
+    sum_over_taps,
+)
 from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
 
 GAIN_LEVELS = 3  # a-trous levels on the grid of cells: reach of +-14 cells
 OFFSET_LEVELS = 1  # +-2 cells
 LARGEST_GAIN = 50.0
+STRIP_CELLS = 4  # rows of cells whose pixels are in hand at once: the fastest of 1 to 16 at 1920 pixels width
 _OFFSETS = square_offsets(2)
 _B3 = np.array([1, 4, 6, 4, 1]) / 16.0  # the B3 spline
 _DARK = 1e-6  # mean luminance below which a ratio means nothing
 _TINY = 1e-12
 
 Color = tuple[Array, ...]  # red, green, blue
+
+
+class Pixels(NamedTuple):
+    """What is compared, and what of each pixel says with whom: trees of planes; `known` is 1 where there is history."""
+
+    guides: Guides
+    slope: tuple[Array, Array]
+    known: Array
+    current: tuple[Color, ...]
+    history: tuple[Color, ...]
+    moments: tuple[tuple[Array, ...], ...]
 
 
 class Cells(NamedTuple):
@@ -107,6 +129,14 @@ class Correction(NamedTuple):
     variance: Array
 
 
+class Around(NamedTuple):
+    """What a pixel reads of the cells near it: planes `[h, w]`; `knows` is 1 where a cell can tell anything."""
+
+    guides: Guides
+    knows: Array
+    corrections: tuple[Correction, ...]
+
+
 def follow_light(
     previous: Reprojected, illumination: Array, frame: Frame, *, params: Params, config: Config
 ) -> Reprojected:
@@ -127,43 +157,57 @@ def follow_light(
     if size == 0:
         return previous
     scalars = at_level(params, 0)
-    height, width = frame.depth.shape
-    split = lambda tree: jax.tree.map(lambda plane: _phases(plane, size), tree)  # noqa: E731
-    guides = split(guides_of(frame))
-    slope = split(depth_gradient(frame.depth, frame.object_id))
-    known = split(previous.valid.astype(frame.depth.dtype))
-    current = tuple(split(planes(signal)) for signal in illumination)
-    history = tuple(split(planes(signal)) for signal in previous.illumination)
-    moments = tuple(split(planes(signal)) for signal in previous.moments)
-
-    cells, sums = _gather(guides, slope, known, current, history, moments, size=size, scalars=scalars)
-    corrections = _judge(cells, sums, size=size, scalars=scalars)
-    corrected = _apply(cells, corrections, guides, slope, known, history, moments, size=size, scalars=scalars)
-    history, moments, change = zip(*corrected, strict=True)
-    join = lambda phases: _unphase(phases, size, height, width)  # noqa: E731
-    return previous._replace(
-        illumination=jnp.stack([jnp.stack([join(c) for c in signal], axis=-1) for signal in history]),
-        moments=jnp.stack([jnp.stack([join(m) for m in signal], axis=-1) for signal in moments]),
-        change=jnp.stack([join(signal) for signal in change]),
+    pixels = Pixels(
+        guides_of(frame),
+        depth_gradient(frame.depth, frame.object_id),
+        previous.valid.astype(frame.depth.dtype),
+        tuple(planes(signal) for signal in illumination),
+        tuple(planes(signal) for signal in previous.illumination),
+        tuple(planes(signal) for signal in previous.moments),
     )
+    cells, sums = _over_cells(partial(_gather, size=size, scalars=scalars), pixels, size=size)
+    corrections = _judge(cells, sums, size=size, scalars=scalars)
+    around = add_margin(Around(cells.guides, (cells.weight > _TINY).astype(frame.depth.dtype), corrections), 1, 1)
+    corrected = _over_cells(partial(_apply, size=size, scalars=scalars), pixels._replace(current=()), around, size=size)
+    light, moments, change = zip(*corrected, strict=True)
+    return previous._replace(illumination=stack_planes(light), moments=stack_planes(moments), change=jnp.stack(change))
 
 
-def _phases(plane: Array, size: int) -> Array:
-    """`[H, W]` -> `[size^2, h, w]`: entry a * size + b holds pixel (a, b) of every cell; 0 beyond the image."""
-    height, width = plane.shape
-    padded = jnp.pad(plane, ((0, -height % size), (0, -width % size)))
-    rows, columns = padded.shape[0] // size, padded.shape[1] // size
-    return padded.reshape(rows, size, columns, size).transpose(1, 3, 0, 2).reshape(size * size, rows, columns)
+def _over_cells(function: Callable[..., Planes], pixels: Pixels, around: Planes = None, *, size: int) -> Planes:
+    """`function(pixels, around)` of a strip of cells after the other, so that all stays in the cache.
 
+    It gets the pixels as *phases* `[size^2, rows, w]`: entry a * size + b holds pixel (a, b) of every cell, 0 beyond the image; and
+    of `around`, planes of cells with a margin of 1, `[rows + 2, w + 2]`. It returns planes of cells `[rows, w]`, or phases again.
+    """
+    height, width = pixels.known.shape
+    down, across = -(-height // size), -(-width // size)
+    count, rows = split_rows(down, across, STRIP_CELLS)
+    below = count * rows - down
+    around = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), around)
 
-def _unphase(phases: Array, size: int, height: int, width: int) -> Array:
-    _, rows, columns = phases.shape
-    plane = phases.reshape(size, size, rows, columns).transpose(2, 0, 3, 1)
-    return plane.reshape(rows * size, columns * size)[:height, :width]
+    def split(plane: Array) -> Array:
+        padded = jnp.pad(plane, ((0, (down + below) * size - height), (0, across * size - width)))
+        return padded.reshape(count, rows, size, across, size)
+
+    def join(found: Array) -> Array:
+        if found.ndim == 2:
+            return found
+        return found.reshape(size, size, rows, across).transpose(2, 0, 3, 1).reshape(rows * size, across * size)
+
+    def strip(given: tuple[Array, Pixels]) -> Planes:
+        first, pixels = given
+        phases = jax.tree.map(lambda a: a.transpose(1, 3, 0, 2).reshape(size * size, rows, across), pixels)
+        near = jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, first, rows + 2), around)
+        return jax.tree.map(join, function(phases, near))
+
+    strips = jnp.arange(count, dtype=jnp.int32) * rows, jax.tree.map(split, pixels)
+    found = lax.map(jax.checkpoint(strip, prevent_cse=False), strips)  # type: ignore[arg-type]
+    crop = lambda a: a[:down] if a.shape[1] == across else a[:height, :width]  # noqa: E731
+    return jax.tree.map(lambda a: crop(a.reshape(-1, a.shape[-1])), found)
 
 
 def _from_centre(size: int) -> np.ndarray:
-    """Offsets (dy, dx) of a cell's pixels from its central one, `[size^2, 2]`, in the order of `_phases`."""
+    """Offsets (dy, dx) of a cell's pixels from its central one, `[size^2, 2]`, in the order of the phases."""
     reach = np.arange(size) - size // 2
     return np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
 
@@ -180,10 +224,9 @@ def _weight(p: Guides, q: Guides, slope: tuple[Array, Array], dy: Array, dx: Arr
     return p.surface * q.surface * jnp.exp(exponent)
 
 
-def _gather(
-    guides, slope, known, current, history, moments, *, size: int, scalars: Params
-) -> tuple[Cells, tuple[Sums, ...]]:
+def _gather(pixels: Pixels, _: None, *, size: int, scalars: Params) -> tuple[Cells, tuple[Sums, ...]]:
     """Sums over the cells' own pixels, weighted by likeness to the central one."""
+    guides, slope, known, current, history, moments = pixels
     centre = (size // 2) * (size + 1)
     cell_guides, cell_slope = jax.tree.map(lambda a: a[centre], (guides, slope))
     distance = jnp.asarray(_from_centre(size), known.dtype)
@@ -199,11 +242,8 @@ def _gather(
     colors = tuple(zip(current, history, moments, strict=True))
     zero = jnp.zeros(known.shape[1:], known.dtype)
     nothing = tuple(Sums((zero,) * 3, (zero,) * 3, zero, zero, zero, zero) for _ in colors)
-    (weight, square, totals), _ = lax.scan(
-        jax.checkpoint(add, prevent_cse=False),  # type: ignore[arg-type]
-        (zero, zero, nothing),
-        (guides, known, colors, (distance[:, 0], distance[:, 1])),
-    )
+    phases = guides, known, colors, (distance[:, 0], distance[:, 1])
+    (weight, square, totals), _ = lax.scan(add, (zero, zero, nothing), phases)
     return Cells(cell_guides, cell_slope, weight, square), totals
 
 
@@ -333,51 +373,36 @@ def _ratio(current: Array, previous: Array, scale: Array, significance: Array) -
     return 1.0 + jnp.where(lit, significance * (jnp.clip(ratio, 1.0 / LARGEST_GAIN, LARGEST_GAIN) - 1.0), 0.0)
 
 
-def _apply(cells: Cells, corrections, guides, slope, known, history, moments, *, size: int, scalars: Params):
+def _apply(pixels: Pixels, around: Around, *, size: int, scalars: Params):
     """Bring the corrections to the pixels, from the 2 x 2 cells whose central pixels surround each."""
-    _, rows, columns = known.shape
+    rows, columns = pixels.known.shape[1:]
     offset = _from_centre(size)
     first = np.where(offset < 0, -1, 0)  # of the two cells along an axis, relative to the pixel's own
     fraction = offset / size - first
     corners = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
     cell = first[:, None] + corners  # [size^2, 4, 2]
     share = np.where(corners == 1, fraction[:, None], 1.0 - fraction[:, None]).prod(axis=-1)
-    distance = jnp.asarray(cell * size - offset[:, None], known.dtype)
-    around = add_margin((cells.guides, (cells.weight > _TINY).astype(known.dtype), corrections), 1, 1)
+    away = jnp.asarray(cell * size - offset[:, None], pixels.known.dtype)
 
     def pixel(phase):
-        p, p_slope, with_history, colors, pairs, corner, shares, away = phase
+        (p, slope, known, _, colors, pairs), corner, shares, away = phase
 
         def add(sums, tap):
             at, part, far = tap
-            q, knows, values = jax.tree.map(
-                lambda plane: lax.dynamic_slice(plane, (at[0], at[1]), (rows, columns)), around
-            )
-            weight = part * knows * _weight(p, q, p_slope, far[0], far[1], scalars)
+            q, knows, values = jax.tree.map(lambda a: lax.dynamic_slice(a, (at[0], at[1]), (rows, columns)), around)
+            weight = part * knows * _weight(p, q, slope, far[0], far[1], scalars)
             return (sums[0] + weight, jax.tree.map(lambda s, v: s + weight * v, sums[1], values)), None
 
-        zero = jnp.zeros((rows, columns), known.dtype)
-        sums = (zero, jax.tree.map(lambda _: zero, corrections))
+        zero = jnp.zeros_like(known)
+        sums = (zero, jax.tree.map(lambda _: zero, around.corrections))
         (weight, totals), _ = lax.scan(add, sums, (corner, shares, away), unroll=len(corners))
-        found = (weight > 1e-8) & (with_history > 0.0)
+        found = (weight > 1e-8) & (known > 0.0)
         divisor = jnp.where(found, weight, 1.0)
         corrected = [_correct(c, m, t, divisor) for c, m, t in zip(colors, pairs, totals, strict=True)]
         as_it_was = tuple((c, m, zero) for c, m in zip(colors, pairs, strict=True))
         return jax.tree.map(lambda new, old: jnp.where(found, new, old), tuple(corrected), as_it_was)
 
-    return lax.map(
-        jax.checkpoint(pixel, prevent_cse=False),  # type: ignore[arg-type]
-        (
-            guides,
-            slope,
-            known,
-            history,
-            moments,
-            jnp.asarray(cell + 1, jnp.int32),
-            jnp.asarray(share, known.dtype),
-            distance,
-        ),
-    )
+    return lax.map(pixel, (pixels, jnp.asarray(cell + 1, jnp.int32), jnp.asarray(share, away.dtype), away))
 
 
 def _correct(color: Color, moments: tuple[Array, Array], total: Correction, divisor: Array):
