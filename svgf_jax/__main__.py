@@ -8,7 +8,9 @@ def main() -> None:
 
     from svgf_jax import prints
     from svgf_jax.cli import main as cli_main
+    from svgf_jax.commands import terminal
 
+    terminal.open_streams()
     with contextlib.suppress(OSError, AttributeError, ValueError):  # a closed standard error
         faulthandler.enable()  # what the EXR or the video library breaks does not end in silence
     prints.set_results_apart()

@@ -82,7 +82,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     Where whoever read the output has had enough (`| head`) it ends quietly: with 141 if there was more to come.
     """
-    terminal.open_streams()
     try:
         code = app.meta(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
