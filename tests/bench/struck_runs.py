@@ -82,6 +82,7 @@ def stopped_after(place: Place, frame: int, command: list[str], **options) -> su
     for line in process.stderr:
         if line.startswith(f"frame {frame}:"):
             process.send_signal(signal.SIGSTOP)
+            os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)  # it takes a moment
             return process
     raise AssertionError(f"{' '.join(command)} ended before frame {frame}: {process.wait()}")
 
