@@ -8,6 +8,7 @@ Prints how many kills there were, how many runs they made, and whether each para
 """
 
 import argparse
+import difflib
 import os
 import random
 import re
@@ -26,8 +27,8 @@ WHAT = ["--tune", "alpha,sigma_luminance,max_history", "--set", "levels=1", "--f
 
 
 def numbers(path: Path) -> str:
-    """The parameter file without the times in it."""
-    return re.sub(r"(?m)^written = .*$", "", path.read_text(encoding="utf-8"))
+    """The parameter file without its time and its scores, which are measured after the fit."""
+    return re.sub(r"(?m)^written = .*$", "", path.read_text(encoding="utf-8")).partition("[provenance.scores")[0].strip()
 
 
 def crop(folder: Path) -> Path:
@@ -76,9 +77,10 @@ def main(kills: int, seed: int) -> None:
                 assert all(name.startswith(".") for name in others), others
                 if out.exists():
                     break  # killed while it measured: the parameters are there
-            assert numbers(out).split("[provenance.scores")[0] == numbers(whole).split("[provenance.scores")[0], (
-                "differs"
+            difference = "\n".join(
+                difflib.unified_diff(numbers(whole).splitlines(), numbers(out).splitlines(), "whole", "resumed")
             )
+            assert not difference, difference
             print(f"{killed} kills, {resumed} resumed, {rounds} fits, all as undisturbed", flush=True)
 
 
