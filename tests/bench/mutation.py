@@ -74,7 +74,10 @@ def fixed_places(tree: ast.AST) -> list[tuple[int, int]]:
             nodes += [*node.args.defaults, *node.args.kw_defaults, node.returns, *node.decorator_list]
         if isinstance(node, ast.arg | ast.AnnAssign):
             nodes.append(node.annotation)
-        if isinstance(node, ast.keyword) and node.arg in ("strict", "prevent_cse"):  # checks; what is stored: no numbers
+        if isinstance(node, ast.keyword) and node.arg in (
+            "strict",
+            "prevent_cse",
+        ):  # checks; what is stored: no numbers
             nodes.append(node.value)
     return [((n.lineno, n.col_offset), (n.end_lineno, n.end_col_offset)) for n in nodes if n is not None]
 

@@ -28,7 +28,9 @@ WHAT = ["--tune", "alpha,sigma_luminance,max_history", "--set", "levels=1", "--f
 
 def numbers(path: Path) -> str:
     """The parameter file without its time and its scores, which are measured after the fit."""
-    return re.sub(r"(?m)^written = .*$", "", path.read_text(encoding="utf-8")).partition("[provenance.scores")[0].strip()
+    return (
+        re.sub(r"(?m)^written = .*$", "", path.read_text(encoding="utf-8")).partition("[provenance.scores")[0].strip()
+    )
 
 
 def crop(folder: Path) -> Path:
