@@ -46,9 +46,13 @@ def advice(roles: Roles, half: Collection[str], cameras: Cameras | None, table: 
     means = {role: layer.meaning.split() for role, layer in roles.layers.items()}
     if not cameras and "camera" in means.get("normal", ()) and "or" not in means["normal"]:
         setting = _switch_on("normal", table)
-        yield f"normals are in camera space, and no camera is known: where it turns, history will be lost.{setting}"
+        text = "normals are in camera space, and no camera is known: where it turns, history will be lost. Give a cameras.json."
+        yield f"{text}{setting}"
     if not cameras and means.get("depth") == ["distance"]:
-        yield "depth is the distance along the ray, and no camera is known to make z of it: slopes will be a little off."
+        text = (
+            "depth is the distance along the ray, and no camera is known to make z of it: slopes will be a little off."
+        )
+        yield f"{text} Give a cameras.json."
     for role in ("depth", "position"):
         if role in half:
             yield f"{role} is in half float, in steps of 0.1 %: slopes become stairs. Let the renderer write 32-bit."

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
-from svgf_jax.geometry import RAY_DISTANCE, VIEW_Z, Fit
+from svgf_jax.geometry import RAY_DISTANCE, SPACES, VIEW_Z, WORLD, Z_AFTER_ALL, Z_BUFFER, Fit
 from svgf_jax.inspection import Facts, declared
 from svgf_jax.motion import Convention
 from svgf_jax.remedies import remedy
@@ -159,7 +159,10 @@ def undivided(facts: Facts) -> str:
 def _guides(facts: Facts, renderer: str) -> Iterator[Finding]:
     if facts.below > 0.01:
         text = f"depth is negative in {_percent(facts.below)} of the pixels."
-        yield Finding("warning", "depth sign", text, remedy("depth sign", renderer))
+        kind = "z" if facts.roles.layers["depth"].meaning == "z-back" else "z-back"
+        yield Finding(
+            "warning", "depth sign", text, f"{remedy('depth sign', renderer)} Or say so: --meaning depth={kind}."
+        )
     if facts.background == 1:
         text = "no pixel has a surface: everything would pass through unfiltered."
         yield Finding(
@@ -175,9 +178,10 @@ def _guides(facts: Facts, renderer: str) -> Iterator[Finding]:
         text = f"{count} normals in {_frames(facts)} are not of unit length: brought to it."
         yield Finding("note", "normals", text, "")
     if facts.normals is not None and not facts.packed:
-        yield from _normals(facts.normals, renderer)
+        found = _normals(facts.normals, renderer, facts.roles.layers["normal"].meaning)
+        yield from (one._replace(remedy=_mend_first(facts) or one.remedy) for one in found)
     if facts.depth is not None and facts.depth.best != (VIEW_Z,):
-        yield from _depth(facts.depth, renderer)
+        yield from _depth(facts.depth, facts)
     halves = facts.halves
     if halves.position is not None and halves.position > 0.25:
         text = f"positions in half float are rounded to steps of {halves.position:.2g} of the distance between neighbouring pixels."
@@ -187,34 +191,60 @@ def _guides(facts: Facts, renderer: str) -> Iterator[Finding]:
         yield Finding("warning", "half float", text, remedy("half", renderer))
 
 
-def _normals(fit: Fit, renderer: str) -> Iterator[Finding]:
+def _mend_first(facts: Facts) -> str:
+    """What to mend before what positions say can be believed: "" if they do not come from a depth that is none."""
+    wrong = facts.depth is not None and facts.depth.best in ((), (Z_BUFFER,)) and "position" not in facts.roles.layers
+    return "Mend depth first: this was judged by positions from it." if wrong and facts.cameras else ""
+
+
+def _normals(fit: Fit, renderer: str, meaning: str) -> Iterator[Finding]:
     nearest = min(fit.misfit, key=lambda name: fit.misfit[name])
+    either = "or" in meaning.split()  # whichever the cameras confirm
+    read = SPACES.get(meaning, WORLD) if len(fit.misfit) > 1 and not either else WORLD
     if not fit.best:
         text = f"normals agree with those of the surfaces in no space ({fit.misfit[nearest]:.0f} degrees off in {nearest})."
-        yield Finding(
-            "warning",
-            "normals",
-            text,
-            "Look at the channels of normal, position and depth: one of them is something else.",
+        change = "Look at the channels of normal, position and depth: one of them is something else."
+        yield Finding("warning", "normals", text, change)
+    elif read not in fit.best and not (either and SPACES["camera"] in fit.best):
+        off_by = f"{fit.misfit[read]:.0f} degrees off those of the surfaces in {read}"
+        change = "" if nearest == WORLD else remedy("normal space", renderer)
+        if len(fit.best) == 1:
+            words = next((words for words, name in SPACES.items() if name == nearest), "world")
+            change = f"{change} {'Or say' if change else 'Say'} so: --meaning {shlex.quote(f'normal={words}')}.".strip()
+        text = f"normals are in {' or in '.join(fit.best)}, {off_by}{', as which they are read' * (read != WORLD)}."
+        yield Finding("warning", "normals", text, change)
+
+
+def _depth(fit: Fit, facts: Facts) -> Iterator[Finding]:
+    renderer, read = facts.table.name, facts.roles.layers["depth"].meaning
+    if fit.best == (RAY_DISTANCE,) and read == "distance":
+        return  # without a camera nothing can be made of it: loading says so
+    if fit.best == (RAY_DISTANCE,):
+        text = "depth is the length of the ray, not the distance along the viewing axis: history and edges will be judged wrongly."
+        change = remedy("depth kind", renderer)
+        say = (
+            "say so: --meaning depth=distance."
+            if facts.cameras
+            else "give a cameras.json, and say so: --meaning depth=distance."
         )
-    elif "world space" not in fit.best:
-        text = f"normals are in {nearest}, {fit.misfit['world space']:.0f} degrees off those of the surfaces in world space."
-        yield Finding("warning", "normals", text, remedy("normal space", renderer))
-
-
-def _depth(fit: Fit, renderer: str) -> Iterator[Finding]:
-    if len(fit.best) == 1:
-        kind = "the length of the ray" if fit.best[0] == RAY_DISTANCE else "what a z buffer holds"
-        text = f"depth is {kind}, not the distance along the viewing axis: history and edges will be judged wrongly."
-        yield Finding("warning", "depth", text, remedy("depth kind", renderer))
+        yield Finding("warning", "depth", text, f"{change} Or {say}")
+    elif fit.best == (Z_AFTER_ALL,):
+        text = "depth is the distance along the viewing axis, not the length of the ray as which it is read."
+        yield Finding("warning", "depth", text, "Say so: --meaning depth=z.")
+    elif fit.best == (Z_BUFFER,):
+        text = "depth is what a z buffer holds, not the distance along the viewing axis: history and edges will be judged wrongly."
+        yield Finding("warning", "depth", text, f"{remedy('depth kind', renderer)} No --meaning makes z of a z buffer.")
     elif fit.best:
         yield Finding("note", "depth", f"cannot tell whether depth is {' or '.join(fit.best)} here.", "")
     else:
         text = "depth is neither view z nor the length of a ray: flat surfaces are not flat."
-        yield Finding("warning", "depth", text, remedy("depth kind", renderer))
+        change = f"{remedy('depth kind', renderer)} Is this channel depth at all, and the cameras.json of these frames?"
+        yield Finding("warning", "depth", text, change)
 
 
 def _motion(facts: Facts, renderer: str) -> Iterator[Finding]:
+    if facts.background == 1:
+        return
     if facts.motion is None:
         if facts.warped is not None and off(facts.warped):
             yield _as_read(facts.warped)
@@ -230,7 +260,7 @@ def _motion(facts: Facts, renderer: str) -> Iterator[Finding]:
             pixels = f"{facts.moved} pixels show another surface than in the frame before"
             text = f"motion vectors are all 0, though the scene moves: {_off(facts, None):.2g} pixels off."
             text = text if moves else f"motion vectors are all 0, though something moves: {pixels}."
-            yield Finding("warning", "motion", text, remedy("zero motion", renderer))
+            yield Finding("warning", "motion", text, f"{remedy('zero motion', renderer)} {_without_vectors(facts)}")
             return
         still = facts.continuity is not None and facts.continuity.still > 0.98
         if not judged or not vectors or (still and not moves):
@@ -242,12 +272,8 @@ def _motion(facts: Facts, renderer: str) -> Iterator[Finding]:
             f"no motion convention fits: {best:.2g} pixels off at best, {_off(facts, None):.2g} without any motion. "
             "Motion blur, other frames' vectors, or motion that stands for something else?"
         )
-        yield Finding(
-            "warning",
-            "motion",
-            text,
-            "Look at the channels of motion; with positions and a cameras.json they are not needed.",
-        )
+        change = _mend_first(facts) or f"Look at the channels of motion. {_without_vectors(facts)}"
+        yield Finding("warning", "motion", text, change)
         return
     own = declared(facts.roles)
     if own not in fits:
@@ -259,6 +285,13 @@ def _motion(facts: Facts, renderer: str) -> Iterator[Finding]:
     elif len(fits) > 1:
         others = ", ".join(f"'{one}'" for one in fits if one != own)
         yield Finding("note", "motion", f"motion could as well be {others}: these frames do not tell.", "")
+
+
+def _without_vectors(facts: Facts) -> str:
+    """How to do without the motion vectors in the files."""
+    if facts.cameras:
+        return "Or take it from the cameras: --channel motion=none."
+    return "Or take it from cameras: write a cameras.json, and say --channel motion=none."
 
 
 def _as_read(warped: Residual) -> Finding:

@@ -21,7 +21,7 @@ from svgf_jax.camera_files import find_cameras
 from svgf_jax.cameras import Cameras
 from svgf_jax.exr_layout import PathName, Window
 from svgf_jax.motion import parse_convention
-from svgf_jax.roles import Roles, canonical_role, check_channels, resolve_roles
+from svgf_jax.roles import Roles, canonical_role, check_channels, left_out, resolve_roles
 from svgf_jax.sequences import Missing, Sequence, beside, companion, find_sequence, patterns
 from svgf_jax.types import Frame, SvgfError
 
@@ -90,6 +90,7 @@ def open_source(
     renderer: str = "auto",
     layer: str | None = None,
     motion: str | None = None,
+    meaning: Mapping[str, str] | None = None,
     position: bool = False,
     max_pixels: int | None = None,
 ) -> Source:
@@ -100,7 +101,7 @@ def open_source(
         frames: a range such as `1-100`, `1-100x2`; all that are there if None.
         missing: what to do about missing frames: "error", "hold" or "reset".
         warmup: also so many frames before them, to fill the history (see `find_sequence`).
-        channel: role -> channel names, where they are not the native ones (see `svgf_jax.roles`).
+        channel: role -> channel names, where they are not the native ones (see `svgf_jax.roles`); ["none"] = leave it out.
         file: role -> pattern of files that hold this role.
         cameras: a cameras.json, or GAMES202's `matrix_#.mat`; "auto" takes those beside the frames if there are any,
             None none.
@@ -108,6 +109,7 @@ def open_source(
             by the names of channels, header attributes and files.
         layer: the view layer, where a file has several.
         motion: what the motion vectors mean, in place of what the renderer's table says: words of `svgf_jax.motion`.
+        meaning: role -> what other numbers mean, likewise: words of `svgf_jax.renderers`.
         position: also give each frame its world positions, which the joint bilateral filter reads: the renderer's, or from
             depth and cameras.
         max_pixels: refuse larger pictures; those of more than 2**28 pixels if None.
@@ -115,7 +117,10 @@ def open_source(
     Raises SvgfError: whatever is missing or unclear, naming the file.
     """
     table = None if renderer == "auto" else renderers.load_table(renderer)
-    meaning = {} if motion is None else {"motion": str(parse_convention(motion))}
+    means = dict(meaning or {})
+    for role, text in means.items():
+        renderers.check_meaning(role, text)
+    means |= {} if motion is None else {"motion": str(parse_convention(motion))}
     sequence = _find_frames(pattern, table, frames=frames, missing=missing, warmup=warmup)
     at, path = next((i, path) for i, (_, path) in enumerate(sequence.files) if path is not None)
     read_header = partial(exr.read_header, max_pixels=max_pixels)
@@ -129,13 +134,14 @@ def open_source(
     def settle(found: Iterable[str] = ()) -> Roles:
         names = {role: (name, tuple(other.channels)) for role, (name, other) in own.items()}
         return resolve_roles(
-            channels, channel=channel, files=names, beside=tuple(found), table=table, meaning=meaning, where=path
+            channels, channel=channel, files=names, beside=tuple(found), table=table, meaning=means, where=path
         )
 
     roles = settle()
-    near = {role: where for role in _BESIDE if role not in roles.layers and (where := _beside(sequence, role))}
+    settled = roles.layers.keys() | left_out(channel)
+    near = {role: where for role in _BESIDE if role not in settled and (where := _beside(sequence, role))}
     for role, globs in table.files.items():
-        if role not in roles.layers and (where := renderers.find_file(role, globs, there, where=path)):
+        if role not in settled and (where := renderers.find_file(role, globs, there, where=path)):
             near[role] = where
     if near:
         files |= {role: companion(sequence, where) for role, where in near.items()}
@@ -157,7 +163,7 @@ def open_source(
         types = own[role][1].channels if one.own_file else header.channels
         if np.dtype(np.float16) in {types[name] for name in one.channels}:
             half.add(role)
-    told = tuple(advice(roles, half, found, table._replace(uncertain=()) if meaning else table))
+    told = tuple(advice(roles, half, found, table._replace(uncertain=()) if "motion" in means else table))
     return Source(
         sequence,
         roles,

@@ -15,7 +15,12 @@ CAMERA_AXES = {
 }
 """Signs that take the camera space of `Camera`, the first of these, to those of others."""
 
+SPACES: dict[str, str] = dict(zip(("camera y-down", "camera z-back", "camera"), CAMERA_AXES, strict=True))
+"""Those spaces by the words for them in tables (`svgf_jax.renderers`)."""
+WORLD = "world space"
+
 VIEW_Z, RAY_DISTANCE, Z_BUFFER = "view z", "ray distance", "z buffer"
+Z_AFTER_ALL = "view z, not ray distance"
 LEAST = 64  # pixels to judge by
 
 
@@ -43,12 +48,16 @@ class Continuity(NamedTuple):
     still: float
 
 
-def normal_space(frame: Frame, position: np.ndarray, camera: Camera | None) -> Fit | None:
+def normal_space(
+    frame: Frame, position: np.ndarray, camera: Camera | None, *, normals: np.ndarray | None = None
+) -> Fit | None:
     """Degrees between the normals and those of the surfaces that `position` `[H, W, 3]` (world space) draws, medians.
 
-    Which way a normal faces does not count: only products of normals enter the filter. None where there is too little to judge by.
+    `normals` `[H, W, 3]`: those to judge, as the files have them, of any length; the frame's if None. Which way a normal faces
+    does not count: only products of normals enter the filter. None where there is too little to judge by.
     """
-    where = uniform(frame) & np.isfinite(position).all(-1) & np.isfinite(frame.normal).all(-1)
+    normals = np.asarray(frame.normal if normals is None else normals)
+    where = uniform(frame) & np.isfinite(position).all(-1) & np.isfinite(normals).all(-1) & (normals != 0).any(-1)
     with np.errstate(all="ignore"):
         across, down = (_central(position.astype(np.float64), axis) for axis in (1, 0))
         facing = np.cross(across, down)
@@ -56,8 +65,9 @@ def normal_space(frame: Frame, position: np.ndarray, camera: Camera | None) -> F
         where &= np.isfinite(length) & (length > 0)
         if where.sum() < LEAST:
             return None
-        facing, normal = facing[where] / length[where, None], frame.normal[where].astype(np.float64)
-        spaces = {"world space": facing}
+        facing, normal = facing[where] / length[where, None], normals[where].astype(np.float64)
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        spaces = {WORLD: facing}
         if camera is not None:
             turned = facing @ camera.world_to_camera[:3, :3].T
             spaces |= {name: turned * signs for name, signs in CAMERA_AXES.items()}

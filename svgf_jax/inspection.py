@@ -12,7 +12,7 @@ from svgf_jax.advising import absences
 from svgf_jax.cameras import Camera, find_camera
 from svgf_jax.estimates import Estimate, estimate
 from svgf_jax.frames import LoadedFrame, Source, read_frame, read_planes, told_once
-from svgf_jax.geometry import Fit
+from svgf_jax.geometry import VIEW_Z, Z_AFTER_ALL, Fit
 from svgf_jax.motion import Convention, parse_convention
 from svgf_jax.noise import Fireflies
 from svgf_jax.renderers import Table
@@ -75,7 +75,8 @@ class Facts(NamedTuple):
         repaired: pixels repaired on loading, by reason (`frames.LoadedFrame`).
         packed: whether normals look as if brought to 0 ... 1.
         below: share of the depths that are negative.
-        normals, depth: what they fit.
+        cameras: whether they tell the motion where no channel does.
+        normals, depth: what they fit; normals as in the files if a camera is known, depth as read.
         halves: hazards of half floats.
         motion: which conventions the motion vectors fit; None without two frames in a row or motion vectors in screen space.
         moved: surface pixels that show another surface than the frame before, edges left out; in the pair with more.
@@ -103,6 +104,7 @@ class Facts(NamedTuple):
     repaired: dict[str, int]
     packed: bool
     below: float
+    cameras: bool
     normals: Fit | None
     depth: Fit | None
     halves: Halves
@@ -186,7 +188,8 @@ def inspect_source(source: Source, *, params: Any = Params(), config: Any = Conf
         background=float(np.mean([(np.asarray(one.loaded.frame.object_id) == -1).mean() for one in read.values()])),
         repaired=dict(sum((Counter(one.loaded.counts) for one in read.values()), Counter())),
         packed=_packed(last.inner),
-        below=_below(last.planes),
+        below=_below(source.roles, last.planes),
+        cameras=source.cameras is not None and bool(source.roles.layers.keys() & {"depth", "position"}),
         normals=_normals(last),
         depth=_depth(source, last),
         halves=_halves(source, last),
@@ -307,25 +310,35 @@ def _packed(planes: dict[str, np.ndarray]) -> bool:
     return stretched < 0.02 < plain
 
 
-def _below(planes: dict[str, np.ndarray]) -> float:
+def _below(roles: Roles, planes: dict[str, np.ndarray]) -> float:
     if "depth" not in planes:
         return 0.0
+    front = -1 if roles.layers["depth"].meaning == "z-back" else 1
     with np.errstate(all="ignore"):
-        return float((planes["depth"] < 0).mean())
+        return float((front * planes["depth"] < 0).mean())
 
 
 def _normals(one: _Read) -> Fit | None:
     frame = one.frame
     if "normal" not in one.planes or frame.position is None:
         return None
-    return geometry.normal_space(frame, np.asarray(frame.position), one.camera)
+    stored = None if one.camera is None else one.inner["normal"]  # without a camera, all stays in the positions' space
+    return geometry.normal_space(frame, np.asarray(frame.position), one.camera, normals=stored)
 
 
 def _depth(source: Source, one: _Read) -> Fit | None:
     if "depth" not in one.planes:
         return None
+    fit = _depth_kind(source, one, np.asarray(one.frame.depth))
+    if fit and VIEW_Z not in fit.best and source.roles.layers["depth"].meaning == "distance" and one.camera is not None:
+        stored = _depth_kind(source, one, one.inner["depth"][..., 0])
+        fit = stored._replace(best=(Z_AFTER_ALL,)) if stored and stored.best == (VIEW_Z,) else fit
+    return fit
+
+
+def _depth_kind(source: Source, one: _Read, depth: np.ndarray) -> Fit | None:
     frame = one.frame
-    depth, surface = np.asarray(frame.depth), np.asarray(frame.object_id) != -1
+    surface = np.asarray(frame.object_id) != -1
     if one.camera is not None and "position" in one.planes:
         return geometry.depth_by_position(depth, np.asarray(frame.position), one.camera, surface)
     (left, top, *_), (screen_left, screen_top, *_) = source.data_window, source.display_window

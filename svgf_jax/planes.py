@@ -3,6 +3,7 @@
 `planes` holds by role what the file has, `[H, W, C]` float32; what its numbers mean is in the roles' layers.
 """
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -96,8 +97,10 @@ def in_world(
     for role, w in (("position", 1.0), ("normal", 0.0)):
         words = means.get(role, "").split()
         if role in planes and "camera" in words:
-            mine = planes[role] * np.array([1, -1, -1 if "z-back" in words else 1], np.float32)
+            mine = planes[role] * np.array(camera_signs(words), np.float32)
             planes[role] = mine if camera is None else from_camera(camera, mine, w).astype(np.float32)
+    if means.get("depth") == "z-back" and "depth" in planes:
+        planes["depth"] = -planes["depth"]
     distance = means.get("depth") == "distance"
     if position is not None and ("depth" not in planes or distance):
         hit = (position != 0).any(-1) & np.isfinite(position).all(-1)
@@ -111,6 +114,11 @@ def in_world(
         planes["depth"] = planes["depth"] / eye_ray_lengths(camera, planes["depth"].shape[:2], origin)[..., None]
         planes["depth"] = planes["depth"].astype(np.float32)
     return planes
+
+
+def camera_signs(words: Collection[str]) -> tuple[int, int, int]:
+    """What takes the camera space of these words to that of `Camera`: x right, y down, z forward."""
+    return (1, 1 if "y-down" in words else -1, -1 if "z-back" in words else 1)
 
 
 def _z_of(position: np.ndarray, camera: Camera | None, space: str) -> np.ndarray | None:

@@ -31,7 +31,7 @@ REMEDIES: dict[str, dict[str, str]] = {
         "cycles": "Combined is denoised while Render > Sampling > Denoise is on: take Noisy Image (--channel radiance=...).",
     },
     "normal space": {
-        "": 'Write world-space normals, or say so: [meaning] normal = "camera" in a table (--renderer mine.toml).',
+        "": "Let the renderer write world-space normals.",
         "cycles": "Take the pass Normal; Denoising Normal is in camera space (--channel normal=...).",
         "pbrt": 'Film "gbuffer" "string coordinatesystem" "world" (the default is camera).',
     },
@@ -39,10 +39,10 @@ REMEDIES: dict[str, dict[str, str]] = {
         "": "Unpack them (2 n - 1) before, or let the renderer write them from -1 to 1 in float.",
     },
     "depth kind": {
-        "": 'Write view z, along the viewing axis, or say so: [meaning] depth = "distance" in a table (--renderer mine.toml).',
+        "": "Let the renderer write linear view z, the distance along the viewing axis.",
     },
     "depth sign": {
-        "": "Write depth as positive in front of the camera: negative ones count as background.",
+        "": "Let the renderer write depth as positive in front of the camera: negative ones count as background.",
     },
     "history": {
         "": "Look at motion, depth and ids above: something does not match between frames. Fast motion has the same effect.",
@@ -57,7 +57,7 @@ REMEDIES: dict[str, dict[str, str]] = {
         "": "Such pixels count as background, or have no history; look at the objects there.",
     },
     "zero motion": {
-        "": "Let the renderer fill them (often not with motion blur); with positions and a cameras.json they are not needed.",
+        "": "Let the renderer fill them (often not with motion blur).",
         "cycles": "Turn off Render > Motion Blur: with it, Cycles writes 0 into the pass Vector.",
     },
     "guides": {

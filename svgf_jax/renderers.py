@@ -15,9 +15,10 @@ A table is data. Its keys (all but `title` may be absent):
 - `uncertain`: roles whose meaning is not known for certain; they are taken as this library's own, and that is told.
 - `[settings]`: role -> what to switch on in the renderer to get it.
 
-Meanings: of `motion` a convention (`svgf_jax.motion`); of `depth` "distance" (along the ray, not z); of `normal` and `position`
-"camera" (x right, y up, z into the picture), "camera z-back", or "camera or world" (whichever the cameras confirm); of `id` the
-number that stands for no object.
+Meanings: of `motion` a convention (`svgf_jax.motion`); of `depth` "z" (this library's), "z-back" (negative in front) or "distance"
+(along the ray); of `normal` and `position` "world" (this library's), "camera" (x right, y up, z into the picture), "camera z-back"
+(y up, z out of it), "camera y-down" (z into it), or "camera or world" (whichever the cameras confirm); of `id` the number that
+stands for no object.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -134,7 +135,11 @@ def _load(path: Path) -> Table:
         else:
             kind = bool if key == "layered" else str if key in ("title", "cameras") else tuple
             fields[key] = _of_type(file, kind, value, key)
-    _check_meaning(file, fields.get("meaning", {}))
+    for role, text in fields.get("meaning", {}).items():
+        try:
+            check_meaning(role, text)
+        except SvgfError as error:
+            raise SvgfError(f"{place(file, 'meaning', role)}: {error}") from None
     lights = {signal.name for signal in fields.get("light", ())}
     for key, known in (("complete", {*lights, *WIDTH}), ("uncertain", set(WIDTH))):
         for name in fields.get(key, ()):
@@ -181,20 +186,19 @@ def _of_type(file: TomlFile, kind: type, value: Any, *keys: str | int) -> Any:
     raise SvgfError(f"{place(file, *keys)}: {name} = {value!r}; wanted {wanted.get(kind, 'tables, [[light]]')}.")
 
 
-def _check_meaning(file: TomlFile, meaning: Mapping[str, str]) -> None:
-    spaces = ("camera", "camera z-back", "camera or world")
-    known = {"depth": ("distance",), "normal": spaces, "position": spaces}
-    for role, text in meaning.items():
-        where = place(file, "meaning", role)
-        if role == "motion":
-            try:
-                parse_convention(text)
-            except SvgfError as error:
-                raise SvgfError(f"{where}: {error}") from None
-        elif role == "id" and not text.lstrip("-").isdigit():
-            raise SvgfError(f"{where}: id means {text!r}; wanted the number that stands for no object.")
-        elif role != "id" and text not in known[role]:
-            raise SvgfError(f"{where}: {role} means {text!r}; wanted {', '.join(known[role])}.")
+def check_meaning(role: str, text: str) -> None:
+    """Raise SvgfError where a role's numbers cannot mean this."""
+    spaces = ("world", "camera", "camera y-down", "camera z-back", "camera or world")
+    known = {"depth": ("z", "z-back", "distance"), "normal": spaces, "position": spaces}
+    if role == "motion":
+        parse_convention(text)
+    elif role == "id":
+        if not text.lstrip("-").isdigit():
+            raise SvgfError(f"id means {text!r}; wanted the number that stands for no object.")
+    elif role not in known:
+        raise SvgfError(f"no meanings of {role!r} are known; only of {', '.join(_NAMES['meaning'])}.")
+    elif text not in known[role]:
+        raise SvgfError(f"{role} means {text!r}; wanted {', '.join(known[role])}.")
 
 
 def detect_renderer(channels: Collection[str], attributes: Iterable[str] = (), files: Collection[str] = ()) -> Table:

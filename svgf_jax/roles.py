@@ -25,8 +25,8 @@ where every signal has one.
 A renderer's own names are in its table (`svgf_jax.renderers`), with those kinds of light that it writes apart, each with its own
 albedo. Where that table says nothing of a role, the native name is looked for. `environment` is added to the emission.
 
-Any role can be given by hand: other channels (`channel`), another file (`file`), or both. What is in neither is looked for in
-files of the same name beside `beauty_####.exr` (or color_): `normal_####.exr`, `depth_####.exr`, `ID_####.exr`, ...
+Any role can be given by hand: other channels (`channel`; "none" leaves the role out), another file (`file`), or both. What is in
+neither is looked for in files of the same name beside `beauty_####.exr` (or color_): `normal_####.exr`, `depth_####.exr`, ...
 """
 
 import difflib
@@ -168,11 +168,15 @@ def resolve_roles(
     Raises SvgfError: no radiance, an unknown role, a channel that is not there (the closest names are listed), a role
     with only some of its channels.
     """
+    without = left_out(channel)
     by_hand = {canonical_role(role): tuple(names) for role, names in (channel or {}).items()}
+    by_hand = {role: names for role, names in by_hand.items() if role not in without}
     own = {canonical_role(role): content for role, content in (files or {}).items()}
     means = {**table.meaning, **(meaning or {})}
     layers = {}
     for role in WIDTH:
+        if role in without:
+            continue
         if role in by_hand or role in own:
             file, names = own.get(role, (where, channels))
             layer = _given(role, by_hand.get(role), names, file, own_file=role in own, means=means.get(role, ""))
@@ -180,7 +184,7 @@ def resolve_roles(
         else:
             layer = _known(role, channels, where, table, means.get(role, ""))
         if layer:
-            layers[role] = layer._replace(meaning=layer.meaning or means.get(role, ""))
+            layers[role] = layer._replace(meaning=(meaning or {}).get(role) or layer.meaning or means.get(role, ""))
     asked = (by_hand.keys() | own.keys()) - set(beside)
     if "radiance" in asked and asked & {"direct", "indirect"}:
         raise SvgfError("radiance is the whole beauty; give by hand either it, or direct and indirect.")
@@ -238,6 +242,11 @@ def canonical_role(name: str) -> str:
     if role not in WIDTH:
         raise SvgfError(f"no role is called {name!r}; roles are {', '.join(WIDTH)}.")
     return role
+
+
+def left_out(channel: Mapping[str, Iterable[str]] | None) -> set[str]:
+    """The roles that are "none" by hand: not to be read, though they may be there."""
+    return {canonical_role(role) for role, names in (channel or {}).items() if tuple(names) == ("none",)}
 
 
 def _light_apart(

@@ -158,7 +158,7 @@ CASES = {
     "negative light": ({"change": spoil}, {}, "negative radiance", "3 negative", "Lanczos"),
     "broken motion": ({"change": spoil}, {}, "broken motion", "12 NaN", "no history"),
     "fireflies": ({"change": sparkle}, {}, "fireflies", "of its pixels", "outlier_radius"),
-    "camera-space normals": ({"change": turn}, {}, "normals", "camera space (x right, y down", "[meaning] normal"),
+    "camera-space normals": ({"change": turn}, {}, "normals", "camera space (x right, y down", "--meaning"),
     "packed normals": ({"change": pack}, {}, "normals", "packed", "2 n - 1"),
     "ray distance": ({"change": stretch}, {}, "depth", "length of the ray", "viewing axis"),
     "ray distance, no positions": (
@@ -178,7 +178,7 @@ CASES = {
         "'fraction y-down to-previous'",
         "--motion 'fraction y-down to-previous'",
     ),
-    "any motion": ({"change": scramble_motion}, {}, "motion", "no motion convention fits", "positions"),
+    "any motion": ({"change": scramble_motion}, {}, "motion", "no motion convention fits", "=none"),
     "vectors of 0": ({"change": no_vectors}, {}, "motion", "all 0, though the scene moves", "motion blur"),
     "vectors of 0, no positions": ({"change": no_vectors, "drop": ["position"]}, {}, "motion", "all 0", "motion blur"),
     "vectors of 0 of Cycles": (
@@ -195,8 +195,8 @@ CASES = {
         "though something moves: ",
         "motion blur",
     ),
-    "half the motion": ({"change": halve_motion, "speed": 3}, {}, "motion", "no motion convention fits", "positions"),
-    "noisy motion": ({"change": jitter_motion, "speed": 3}, {}, "motion", "no motion convention fits", "positions"),
+    "half the motion": ({"change": halve_motion, "speed": 3}, {}, "motion", "no motion convention fits", "=none"),
+    "noisy motion": ({"change": jitter_motion, "speed": 3}, {}, "motion", "no motion convention fits", "=none"),
     "y up read as it is": ({"change": flip}, {"motion": "y-up"}, None, "", ""),
     "still": ({"speed": 0}, {}, "motion", "nothing moves", ""),
     "half positions": (

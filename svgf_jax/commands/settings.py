@@ -69,12 +69,13 @@ class Reading:
     (Not a NamedTuple: of its fields cyclopts sees no annotations.)
 
     Attributes:
-        channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B. Repeatable.
+        channel: The channels of a role, for example albedo=foo.R,foo.G,foo.B; motion=none leaves it out. Repeatable.
         file: The files of a role, for example normal=normal_####.exr. Repeatable.
         cameras: The cameras.json of the sequence, or matrix_#.mat; auto takes the one beside the frames, none ignores it.
         renderer: Whose names and conventions: native, mitsuba, cycles, falcor, pbrt, ..., or a table of your own (mine.toml).
         layer: The view layer, where a file has several.
         motion: What motion vectors mean: pixel|fraction|ndc|world, y-down|y-up, to-previous|from-previous|to-next|from-next.
+        meaning: What others mean: depth=z|z-back|distance, normal=world|camera|camera y-down|camera z-back. Repeatable.
     """
 
     channel: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=NAMES", group=INPUT)] = ()
@@ -83,6 +84,7 @@ class Reading:
     renderer: Annotated[str, RENDERER, Parameter(metavar="NAME", group=INPUT)] = "auto"
     layer: Annotated[str | None, LAYER, Parameter(metavar="NAME", group=INPUT)] = None
     motion: Annotated[str | None, Parameter(metavar="WORDS", group=INPUT)] = None
+    meaning: Annotated[tuple[str, ...], Repeated, Parameter(metavar="ROLE=WORDS", group=INPUT)] = ()
 
     def options(self) -> dict[str, Any]:
         """What they mean to `open_source`."""
@@ -94,6 +96,7 @@ class Reading:
             "renderer": self.renderer,
             "layer": self.layer,
             "motion": self.motion,
+            "meaning": assignments(self.meaning, option="--meaning", example="depth=distance"),
         }
 
 
