@@ -27,6 +27,7 @@ def advice(roles: Roles, half: Collection[str], cameras: Cameras | None, table: 
         cameras: if there are any.
         table: the renderer's, which says what to switch on.
     """
+    yield from _lacking(roles, table)
     yield from absences(roles, cameras, table).values()
     for albedo, divided in dict.fromkeys((one.albedo, one.divided) for one in roles.bare.values()):
         lights = [short_names(one.channels) for one in roles.bare.values() if one.albedo == albedo]
@@ -58,6 +59,23 @@ def advice(roles: Roles, half: Collection[str], cameras: Cameras | None, table: 
             yield f"{role} is in half float, in steps of 0.1 %: slopes become stairs. Let the renderer write 32-bit."
     if cameras and not roles.layers.keys() & {"depth", "position"}:
         yield f"{cameras.path} is of no use without depth or position."
+
+
+def _lacking(roles: Roles, table: Table) -> Iterator[str]:
+    """What a table of one's own names, and the files do not have."""
+    if not table.file:
+        return
+    for role in dict.fromkeys(name.removeprefix("camera_") for name in table.channels):
+        layer = roles.layers.get(role)
+        if layer and (layer.own_file or layer.reason in ("given by hand", f"{table.name} name")):
+            continue
+        named = [text for key in (role, f"camera_{role}") for text in table.channels.get(key, ())]
+        if named:
+            instead = f"taken is {short_names(layer.channels)}, the {layer.reason}" if layer else f"there is no {role}"
+            yield f"{table.file}: {role} is {' or '.join(named)} there, but the files have no such channels; {instead}."
+    for signal in table.light:
+        if signal.name not in roles.layers and signal.name not in roles.bare:
+            yield f"{table.file}: light {signal.name} is {' or '.join(signal.channels)} there, but the files have no such channels."
 
 
 def _switch_on(role: str, table: Table) -> str:

@@ -78,7 +78,7 @@ class Signal(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A renderer's table; see the top of this module."""
+    """A renderer's table; see the top of this module. `file` is where a table of one's own lies."""
 
     name: str
     title: str
@@ -94,6 +94,7 @@ class Table(NamedTuple):
     complete: tuple[str, ...] = ()
     uncertain: tuple[str, ...] = ()
     settings: Mapping[str, str] = _NONE
+    file: str = ""
 
 
 _OURS = ("direct.R", "indirect.R", "normal.X", "depth.Z", "motion.X", "id.I")
@@ -121,9 +122,9 @@ def load_table(name: str) -> Table:
 @cache
 def _load(path: Path) -> Table:
     file = read_toml(path, "table of a renderer")
-    fields: dict[str, Any] = {"name": path.stem, "title": path.stem}
+    fields: dict[str, Any] = {"name": path.stem, "title": path.stem, "file": "" if path.parent == FOLDER else str(path)}
     for key, value in file.content.items():
-        _require_known(file, key, Table._fields[1:], "a table of a renderer", key)
+        _require_known(file, key, Table._fields[1:-1], "a table of a renderer", key)
         if key == "light":
             fields[key] = tuple(_signal(file, i, one) for i, one in enumerate(_of_type(file, list, value, key)))
         elif key in _NAMES:
@@ -140,6 +141,14 @@ def _load(path: Path) -> Table:
             check_meaning(role, text)
         except SvgfError as error:
             raise SvgfError(f"{place(file, 'meaning', role)}: {error}") from None
+    for role, spellings in fields.get("channels", {}).items():
+        for spelling in spellings:
+            stem, _, letters = spelling.rpartition(".")
+            if 1 < (width := WIDTH[role.removeprefix("camera_")]) > len(letters):
+                example = f"{stem or role}.{'XY' if width == 2 else 'XYZ or .RGB'}"
+                raise SvgfError(
+                    f"{place(file, 'channels', role)}: {role} = {spelling!r}; wanted {width} channels, as in {example}."
+                )
     lights = {signal.name for signal in fields.get("light", ())}
     for key, known in (("complete", {*lights, *WIDTH}), ("uncertain", set(WIDTH))):
         for name in fields.get(key, ()):

@@ -23,7 +23,8 @@ A variance is that of the mean of a pixel's samples (the samples' own divided by
 where every signal has one.
 
 A renderer's own names are in its table (`svgf_jax.renderers`), with those kinds of light that it writes apart, each with its own
-albedo. Where that table says nothing of a role, the native name is looked for. `environment` is added to the emission.
+albedo. Where that table says nothing of a role, or a table of one's own names what is not there, the native name is looked for.
+`environment` is added to the emission.
 
 Any role can be given by hand: other channels (`channel`; "none" leaves the role out), another file (`file`), or both. What is in
 neither is looked for in files of the same name beside `beauty_####.exr` (or color_): `normal_####.exr`, `depth_####.exr`, ...
@@ -321,7 +322,7 @@ def _known(role: str, channels: Collection[str], where: str, table: Table, means
         names = pick(role, texts, width, channels, table=table, where=where)
         if names is not None:
             return Layer(names, False, f"{table.name} name", meaning)
-    return None
+    return _native(role, channels, where) if table.file and width == WIDTH[role] else None
 
 
 def _width(role: str, means: str) -> int:

@@ -67,6 +67,7 @@ WRONG = {
     "cameras = 'heder'": (1, "cameras = 'heder'; wanted header, or the name of a file"),
     "complete = ['emision']": (1, "no light or role 'emision' in complete. Did you mean emission?"),
     "uncertain = ['moton']": (1, "no role 'moton' in uncertain. Did you mean motion?"),
+    "[channels]\nnormal = ['normal.XY']": (2, "normal = 'normal.XY'; wanted 3 channels, as in normal.XYZ"),
     "[meaning]\nid = 'none'": (2, "id means 'none'; wanted the number"),
     "[meaning]\nnormal = 'view'": (2, "normal means 'view'; wanted world, camera, camera y-down, camera z-back"),
     "[meaning]\nalbedo = 'sRGB'": (2, "no key 'albedo' in [meaning]. There are motion, depth"),
@@ -89,3 +90,23 @@ def test_what_is_wrong_in_a_table_is_told_with_its_line(tmp_path, text):
 def test_renderers_that_are_not_known():
     with pytest.raises(SvgfError, match=r"no renderer is called 'blender'; there are native, arnold, bmfr, cycles"):
         load_table("blender")
+
+
+def test_what_a_table_of_ones_own_names_and_the_files_lack_is_told(tmp_path):
+    """Its native name is looked for then, so that no light is lost; where a role is given by hand, nothing is said."""
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        '[channels]\ndirect = "nothere.RGB"\nnormal = "gone.XYZ"\n[[light]]\nname = "sun"\nchannels = "sun.RGB"\n'
+    )
+    folder = put(tmp_path / "in", planes("direct", 1) | planes("indirect", 2) | planes("depth", 4, "Z"), "a_1.exr")
+    source = open_source(folder, renderer=str(path))
+    assert source.roles.signals == ("direct", "indirect")
+    said = [text for text in source.warnings if text.startswith(f"{path}: ")]
+    assert (
+        "direct is nothere.RGB there, but the files have no such channels; taken is direct.RGB, the native name"
+        in said[0]
+    )
+    assert "normal is gone.XYZ there, but the files have no such channels; there is no normal" in said[1]
+    assert "light sun is sun.RGB there" in said[2]
+    source = open_source(folder, renderer=str(path), channel={"direct": ["direct.R", "direct.G", "direct.B"]})
+    assert not any("direct is" in text for text in source.warnings)
