@@ -4,6 +4,7 @@ from collections.abc import Collection, Iterator
 
 from svgf_jax.cameras import Cameras
 from svgf_jax.motion import parse_convention
+from svgf_jax.remedies import remedy
 from svgf_jax.renderers import Table
 from svgf_jax.roles import REST, Roles, short_names
 
@@ -56,7 +57,7 @@ def advice(roles: Roles, half: Collection[str], cameras: Cameras | None, table: 
         yield f"{text} Give a cameras.json."
     for role in ("depth", "position"):
         if role in half:
-            yield f"{role} is in half float, in steps of 0.1 %: slopes become stairs. Let the renderer write 32-bit."
+            yield f"{role} is in half float, in steps of 0.1 %: slopes become stairs. {remedy('half', table.name)}"
     if cameras and not roles.layers.keys() & {"depth", "position"}:
         yield f"{cameras.path} is of no use without depth or position."
 

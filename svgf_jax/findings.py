@@ -7,20 +7,21 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 from svgf_jax.geometry import RAY_DISTANCE, SPACES, VIEW_Z, WORLD, Z_AFTER_ALL, Z_BUFFER, Fit
-from svgf_jax.inspection import Facts, declared
+from svgf_jax.inspection import SHORT, Facts, declared
 from svgf_jax.motion import Convention
 from svgf_jax.remedies import remedy
 from svgf_jax.roles import WIDTH
 from svgf_jax.sequences import format_range
-from svgf_jax.warping import NEAR, Residual, off
+from svgf_jax.warping import NEAR, Residual, off, shown
 
 CORRELATED = 0.15
 """Correlation of neighbours' noise from which on it matters: Mitsuba's default filter has 0.37, independent pixels 0."""
+LITTLE = 0.08
+"""Deviation of light brought to 0 ... 1 below which shadows that move are taken for noise: converged pictures reach 0.05."""
 REPEATED = 0.3
 """Correlation of the noise from frame to frame from which on it is the same."""
 FIREFLIES = 0.15  # share of a signal's light
 CONVERGED = 0.03  # relative noise
-SHORT = 0.8  # share of pixels with history
 
 
 class Finding(NamedTuple):
@@ -106,11 +107,11 @@ def _light(facts: Facts, renderer: str) -> Iterator[Finding]:
     if levels and max(levels) < CONVERGED:
         text = f"hardly any noise: at most {100 * max(levels):.2g} % of the light. Converged, or denoised already."
         yield Finding("warning", "noise", text, remedy("little noise", renderer))
-    if facts.correlation is not None and facts.correlation > CORRELATED and (lack := undivided(facts)):
-        text = (
-            f"the noise of neighbouring pixels looks correlated ({facts.correlation:.2f}), but that may be texture: without "
-            f"{lack} the two are not told apart."
-        )
+    if facts.psnr == math.inf and facts.background < 1:
+        text = "the light does not vary at all: black, or one colour."
+        yield Finding("warning", "noise", text, "Look at the channels of light: is this what the renderer wrote?")
+    if facts.correlation is not None and facts.correlation > CORRELATED and (doubt := doubtful(facts)):
+        text = f"the noise of neighbouring pixels looks correlated ({facts.correlation:.2f}), but that may be texture: {doubt}."
         yield Finding("note", "correlated noise", text, f"If it is noise: {remedy('correlation', renderer)}")
     elif facts.correlation is not None and facts.correlation > CORRELATED:
         text = (
@@ -147,13 +148,18 @@ def _light(facts: Facts, renderer: str) -> Iterator[Finding]:
         yield Finding("warning", "half float", text, remedy("half", renderer))
 
 
-def undivided(facts: Facts) -> str:
-    """What lacks for want of which texture that moves counts as noise; "" if nothing does."""
+def doubtful(facts: Facts) -> str:
+    """Why texture, or shadows that move, may count as correlated noise; "" if not."""
+    lack = ""
     if facts.continuity is None:
-        return "two frames in a row"
-    if "motion" in facts.roles.absent:
-        return "motion"
-    return "an albedo" if "albedo" in facts.roles.absent and facts.continuity.still < 0.98 else ""
+        lack = "two frames in a row"
+    elif "motion" in facts.roles.absent:
+        lack = "motion"
+    elif "albedo" in facts.roles.absent and facts.continuity.still < 0.98:
+        lack = "an albedo"
+    if lack:
+        return f"without {lack} the two are not told apart"
+    return "there is little noise, and shadows that move look the same" if (facts.spread or 0.0) < LITTLE else ""
 
 
 def _guides(facts: Facts, renderer: str) -> Iterator[Finding]:
@@ -258,7 +264,7 @@ def _motion(facts: Facts, renderer: str) -> Iterator[Finding]:
         moves, vectors = judged and _off(facts, None) > NEAR, residuals.keys() != {None}
         if not vectors and (moves or facts.moved):
             pixels = f"{facts.moved} pixels show another surface than in the frame before"
-            text = f"motion vectors are all 0, though the scene moves: {_off(facts, None):.2g} pixels off."
+            text = f"motion vectors are all 0, though the scene moves: {shown(_off(facts, None))} pixels off."
             text = text if moves else f"motion vectors are all 0, though something moves: {pixels}."
             yield Finding("warning", "motion", text, f"{remedy('zero motion', renderer)} {_without_vectors(facts)}")
             return
@@ -269,7 +275,7 @@ def _motion(facts: Facts, renderer: str) -> Iterator[Finding]:
             return
         best = min(_off(facts, one) for one in residuals if one is not None)
         text = (
-            f"no motion convention fits: {best:.2g} pixels off at best, {_off(facts, None):.2g} without any motion. "
+            f"no motion convention fits: {shown(best)} pixels off at best, {shown(_off(facts, None))} without any motion. "
             "Motion blur, other frames' vectors, or motion that stands for something else?"
         )
         change = _mend_first(facts) or f"Look at the channels of motion. {_without_vectors(facts)}"
@@ -278,8 +284,14 @@ def _motion(facts: Facts, renderer: str) -> Iterator[Finding]:
     own = declared(facts.roles)
     if own not in fits:
         read = " or ".join(f"'{one}'" for one in fits)
-        text = f"motion vectors follow {read} ({_off(facts, fits[0]):.2g} pixels off), not '{own}' ({_off(facts, own):.2g})."
-        yield Finding("warning", "motion", text, f"Say so: --motion '{fits[0]}'.")
+        text = f"motion vectors follow {read} ({shown(_off(facts, fits[0]))} pixels off), not '{own}' ({shown(_off(facts, own))})."
+        change = f"Say so: --motion '{fits[0]}'."
+        if len(fits) > 1:
+            change = (
+                "These frames do not tell which: inspect some in which the camera moves both ways and turns (--frames), or look "
+                "it up in the renderer's documentation, and say it with --motion."
+            )
+        yield Finding("warning", "motion", text, change)
     elif facts.warped is not None and off(facts.warped):  # of the pair that is worse off
         yield _as_read(facts.warped)
     elif len(fits) > 1:
@@ -295,7 +307,7 @@ def _without_vectors(facts: Facts) -> str:
 
 
 def _as_read(warped: Residual) -> Finding:
-    text = f"motion leads past the same point of the frame before: {warped.pixels:.2g} pixels off, by position."
+    text = f"motion leads past the same point of the frame before: {shown(warped.pixels)} pixels off, by position."
     change = "Look at the channels of motion and at cameras.json: of another frame, of another size, or smoothed?"
     return Finding("warning", "motion", text, change)
 
@@ -308,8 +320,10 @@ def _off(facts: Facts, one: Convention | None) -> float:
 
 def _history(facts: Facts, renderer: str) -> Iterator[Finding]:
     if facts.continuity is not None and facts.continuity.share < SHORT and facts.background < 1:
-        text = f"only {_percent(facts.continuity.share)} of the pixels find their surface in the frame before."
-        yield Finding("warning", "history", text, remedy("history", renderer))
+        text = f"only {_percent(facts.continuity.share)} of the pixels find their surface in the frame before"
+        text += f": {facts.lost}s differ where the motion leads." if facts.lost else "."
+        topic = "history, id" if facts.lost == "id" else "history"
+        yield Finding("warning", "history", text, remedy(topic, renderer))
 
 
 def _frames(facts: Facts) -> str:

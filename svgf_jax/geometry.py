@@ -163,6 +163,19 @@ def continuity(previous: Frame, current: Frame, *, params: Params = Params(), mo
     return Continuity(float(found.mean()), still)
 
 
+def lost_by(previous: Frame, current: Frame, *, params: Params = Params()) -> str:
+    """The one of those tests ("id", "depth" or "normal") without which most of the lost history would be found; "" if none."""
+    one_object = [f._replace(object_id=np.where(np.asarray(f.object_id) == -1, -1, 0)) for f in (previous, current)]
+    without = {
+        "id": continuity(*one_object, params=params).share,
+        "depth": continuity(previous, current, params=params._replace(reproject_depth=np.inf)).share,
+        "normal": continuity(previous, current, params=params._replace(reproject_normal=-2.0)).share,
+    }
+    found = continuity(previous, current, params=params).share
+    best = max(without, key=lambda name: without[name])
+    return best if 1 - without[best] < 0.5 * (1 - found) else ""
+
+
 def expected_length(share: float, *, frames: int, most: float) -> float:
     """Mean history length over a sequence of so many `frames` in which a pixel keeps its history with probability `share`."""
     total = length = 1.0

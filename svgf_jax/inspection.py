@@ -23,6 +23,7 @@ from svgf_jax.warping import Residual, Step, Verdict, find_convention, warp_resi
 
 SIDE = 640  # pixels: of larger pictures, noise, normals, depth and motion are judged in the middle, so many pixels each way
 NOISY = 0.25  # noise relative to the light from which on it can be compared between frames
+SHORT = 0.8  # share of pixels with history below which something is wrong
 
 
 class Broken(NamedTuple):
@@ -69,6 +70,7 @@ class Facts(NamedTuple):
         light: by signal.
         psnr: in dB, of the noisy picture against a converged one, by its own noise.
         correlation: of the noise between neighbouring pixels, of the noisiest signal.
+        spread: deviation of that noise, of light brought to 0 ... 1 (`noise.bounded`).
         repeated: correlation of the noise from frame to frame, likewise.
         broken: by role, where there is anything.
         background: share of all pixels.
@@ -82,6 +84,7 @@ class Facts(NamedTuple):
         moved: surface pixels that show another surface than the frame before, edges left out; in the pair with more.
         warped: how well the motion that the filter gets leads to the frame before; None without two frames in a row.
         continuity: whether the previous frame has what each pixel shows; None without two frames in a row.
+        lost: the test of history ("id", "depth", "normal") by which most is lost, where that is much.
         history: mean history length to expect; None without two frames in a row, and of other methods than svgf.
         needs: of a run.
     """
@@ -98,6 +101,7 @@ class Facts(NamedTuple):
     light: dict[str, Light]
     psnr: float | None
     correlation: float | None
+    spread: float | None
     repeated: float | None
     broken: dict[str, Broken]
     background: float
@@ -112,6 +116,7 @@ class Facts(NamedTuple):
     moved: int
     warped: Residual | None
     continuity: geometry.Continuity | None
+    lost: str
     history: float | None
     needs: Estimate
 
@@ -149,6 +154,7 @@ def inspect_source(source: Source, *, params: Any = Params(), config: Any = Conf
     read = {index: _load(source, index) for index in sorted({index for pair in pairs for index in pair})}
     noises = {index: _noise(one.frame) for index, one in read.items()}
     steps = [(read[before], read[now]) for before, now in pairs if before != now]
+    near = [_correlation(read[b], noises[b], *((read[a], noises[a]) if a != b else (None, None))) for a, b in pairs]
     left, top, right, bottom = source.data_window
     width, height = right - left + 1, bottom - top + 1
     screen_left, screen_top, screen_right, screen_bottom = source.display_window
@@ -180,9 +186,8 @@ def inspect_source(source: Source, *, params: Any = Params(), config: Any = Conf
             for at, name in enumerate(source.roles.signals)
         },
         psnr=_mean(one.psnr for one in noises.values()),
-        correlation=_mean(
-            _correlation(read[b], noises[b], *((read[a], noises[a]) if a != b else (None, None))) for a, b in pairs
-        ),
+        correlation=_mean(one.correlation for one in near),
+        spread=_mean(one.spread for one in near),
         repeated=_mean(_repeated(read[a], read[b], noises[a], noises[b]) for a, b in pairs if a != b),
         broken=_broken(source.roles, read.values()),
         background=float(np.mean([(np.asarray(one.loaded.frame.object_id) == -1).mean() for one in read.values()])),
@@ -199,6 +204,7 @@ def inspect_source(source: Source, *, params: Any = Params(), config: Any = Conf
         moved=max((_moved(a.frame, b.frame) for a, b in steps), default=0),
         warped=_warped(steps),
         continuity=None if share is None or still is None else geometry.Continuity(share, still),
+        lost=_lost(steps, tests) if share is not None and share < SHORT else "",
         history=None
         if share is None or tests is not params
         else geometry.expected_length(share, frames=len(scan.there), most=most),
@@ -248,7 +254,7 @@ def _noise(frame: Frame) -> _Noise:
     return _Noise(signals, noise.expected_psnr(noise.beauty(frame), where, float(surface.mean())), where, lights)
 
 
-def _correlation(now: _Read, noise_now: _Noise, before: _Read | None, noise_before: _Noise | None) -> float | None:
+def _correlation(now: _Read, noise_now: _Noise, before: _Read | None, noise_before: _Noise | None) -> noise.Neighbours:
     """Of the signal with the most noise, by what changed since the frame before if there is one: texture is no noise."""
     found = []
     for at, light in enumerate(noise_now.lights):
@@ -258,7 +264,7 @@ def _correlation(now: _Read, noise_now: _Noise, before: _Read | None, noise_befo
         else:
             changed = noise.change(light, noise_before.lights[at], now.frame, before.frame)
             found.append(noise.neighbours(*changed))
-    return max(found, key=lambda one: one.spread).correlation
+    return max(found, key=lambda one: one.spread)
 
 
 def _repeated(before: _Read, now: _Read, noise_before: _Noise, noise_now: _Noise) -> float | None:
@@ -387,6 +393,12 @@ def _warped(steps: list[tuple[_Read, _Read]]) -> Residual | None:
     found = [warp_residual(a.frame, b.frame, np.asarray(b.frame.motion)) for a, b in steps]
     told = [one for one in found if np.isfinite(one.pixels)]
     return max(told, key=lambda one: one.pixels) if told else None
+
+
+def _lost(steps: list[tuple[_Read, _Read]], params: Params) -> str:
+    """Of all pairs of frames, if they agree."""
+    found = {geometry.lost_by(a.loaded.frame, b.loaded.frame, params=params) for a, b in steps}
+    return found.pop() if len(found) == 1 else ""
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

@@ -47,6 +47,9 @@ REMEDIES: dict[str, dict[str, str]] = {
     "history": {
         "": "Look at motion, depth and ids above: something does not match between frames. Fast motion has the same effect.",
     },
+    "history, id": {
+        "": "Let an object's id stay the same from frame to frame, or leave ids out: --channel id=none.",
+    },
     "broken light": {
         "": "They are set to 0, and their neighbours fill them; find the material or light that makes them.",
     },

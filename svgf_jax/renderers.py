@@ -147,7 +147,7 @@ def _load(path: Path) -> Table:
             if 1 < (width := WIDTH[role.removeprefix("camera_")]) > len(letters):
                 example = f"{stem or role}.{'XY' if width == 2 else 'XYZ or .RGB'}"
                 raise SvgfError(
-                    f"{place(file, 'channels', role)}: {role} = {spelling!r}; wanted {width} channels, as in {example}."
+                    f"{place(file, 'channels', role)}: {role} = {spelling!r}; wanted {width} channels: {example}."
                 )
     lights = {signal.name for signal in fields.get("light", ())}
     for key, known in (("complete", {*lights, *WIDTH}), ("uncertain", set(WIDTH))):

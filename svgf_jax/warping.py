@@ -122,6 +122,11 @@ def find_convention(steps: Sequence[Step], *, size: tuple[int, int] | None = Non
     return Verdict(ranked, tuple(one for one, value in named.items() if value <= 1.1 * best + 0.01))
 
 
+def shown(pixels: float, form: str = ".2g") -> str:
+    """`pixels` of a residual for people: at `FARTHEST` it may be any more."""
+    return f"{FARTHEST:g} or more" if pixels > FARTHEST - 0.05 else f"{pixels:{form}}"
+
+
 def off(residual: Residual) -> bool:
     """Whether motion is further off than noise and jitter explain; told by positions alone, which nothing hides."""
     return residual.guides == ("position",) and residual.pixels > NEAR

@@ -291,7 +291,14 @@ def test_of_the_sample_nothing_is_to_mend(capsys):
     code, out, _ = run(capsys, "inspect", sample(), "--strict")
     assert code == 0
     assert out.splitlines()[-1] == "ready"
-    for text in ("1 (attribute spp)", "pixel y-down to-previous: 0.00", "world space", "view z", "none missing", "zip"):
+    for text in (
+        "1 (attribute spp)",
+        "pixel y-down to-previous (fits): 0.00",
+        "world space",
+        "view z",
+        "none missing",
+        "zip",
+    ):
         assert text in out
 
 

@@ -67,7 +67,7 @@ WRONG = {
     "cameras = 'heder'": (1, "cameras = 'heder'; wanted header, or the name of a file"),
     "complete = ['emision']": (1, "no light or role 'emision' in complete. Did you mean emission?"),
     "uncertain = ['moton']": (1, "no role 'moton' in uncertain. Did you mean motion?"),
-    "[channels]\nnormal = ['normal.XY']": (2, "normal = 'normal.XY'; wanted 3 channels, as in normal.XYZ"),
+    "[channels]\nnormal = ['normal.XY']": (2, "normal = 'normal.XY'; wanted 3 channels: normal.XYZ"),
     "[meaning]\nid = 'none'": (2, "id means 'none'; wanted the number"),
     "[meaning]\nnormal = 'view'": (2, "normal means 'view'; wanted world, camera, camera y-down, camera z-back"),
     "[meaning]\nalbedo = 'sRGB'": (2, "no key 'albedo' in [meaning]. There are motion, depth"),

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     from svgf_jax.findings import Finding
     from svgf_jax.geometry import Fit
     from svgf_jax.inspection import Facts
+    from svgf_jax.warping import Residual
 
 FILTER, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["Filter", "Output"], 1))
-CONVENTIONS = 4  # motion conventions that are shown besides those that fit
+CONVENTIONS = 8  # lines of motion conventions
 Rows = list[tuple[str, str]]
 
 
@@ -156,7 +157,7 @@ def _channels(facts: "Facts") -> Iterator[tuple[str, str]]:
 
 
 def _light(facts: "Facts") -> Iterator[tuple[str, str]]:
-    from svgf_jax.findings import CORRELATED, REPEATED, undivided
+    from svgf_jax.findings import CORRELATED, REPEATED, doubtful
 
     for name, light in facts.light.items():
         level = "hardly any light" if light.noise is None else f"noise {100 * light.noise:.3g} % of the light"
@@ -167,9 +168,11 @@ def _light(facts: "Facts") -> Iterator[tuple[str, str]]:
             else "no fireflies"
         )
         yield name, f"{level}; {flies}"
-    if facts.psnr is not None:
+    if facts.psnr == float("inf"):
+        yield "picture", "no noise at all"
+    elif facts.psnr is not None:
         yield "picture", f"about {facts.psnr:.1f} dB (PSNR that svgf-jax compare would show, by the noise alone)"
-    high = "correlated noise, or texture" if undivided(facts) else "correlated noise"
+    high = "correlated noise, or texture" if doubtful(facts) else "correlated noise"
     yield "neighbours", _correlation(facts.correlation, CORRELATED, "independent noise", high)
     yield "frames", _correlation(facts.repeated, REPEATED, "independent noise", "the same noise again")
     broken = [
@@ -216,22 +219,33 @@ def _fit(fit: "Fit | None", why: str, form: str) -> str:
 
 
 def _motion(facts: "Facts") -> Iterator[tuple[str, str]]:
+    from svgf_jax.warping import shown
+
+    def told(residual: "Residual") -> str:
+        pixels = shown(residual.pixels, ".3g")
+        return f"{pixels} pixels off" + (f" (by {', '.join(residual.guides)})" if "more" not in pixels else "")
+
     if facts.motion is not None:
-        shown = 0
+        groups: dict[str, list[str]] = {}
         for one, residual in facts.motion.residuals.items():
-            fits = one in facts.motion.fits
-            if residual.judged and (fits or one is None or shown < CONVENTIONS):
-                shown += 1
-                off = f"{residual.pixels:.3g}" if residual.pixels < 4 else "4 or more"
-                yield (
-                    ("fits" if fits else ""),
-                    f"{one or 'no motion at all'}: {off} pixels off (by {', '.join(residual.guides)})",
+            if residual.judged:
+                groups.setdefault(told(residual), []).append(
+                    f"{one or 'no motion at all'}{' (fits)' * (one in facts.motion.fits)}"
                 )
-        if not shown:
-            yield "convention", "cannot tell: nothing moves"
+        for row, (text, names) in enumerate(groups.items()):
+            label = "" if row else "tried"
+            if row >= CONVENTIONS:
+                others = sum(map(len, list(groups.values())[row:]))
+                yield label, f"{others} others: {text.partition(' (')[0]}{' or more' * (' or more' not in text)}"
+                break
+            if len(names) > 4 and row:
+                kept = [name for name in names if name == "no motion at all"]
+                names = [*kept, f"{len(names) - len(kept)} others"]
+            yield label, f"{', '.join(names)}: {text}"
+        if not groups:
+            yield "tried", f"cannot tell: {'no surfaces' if facts.background == 1 else 'nothing moves'}"
     if facts.warped is not None and facts.warped.judged:
-        whose = "as read" if "motion" in facts.roles.layers else "by cameras"
-        yield whose, f"{facts.warped.pixels:.3g} pixels off (by {', '.join(facts.warped.guides)})"
+        yield "as read" if "motion" in facts.roles.layers else "by cameras", told(facts.warped)
     if facts.continuity is not None:
         found = f"{100 * facts.continuity.share:.3g} % of the surfaces are found in the frame before"
         long = "" if facts.history is None else f": {facts.history:.1f} frames long on average over the sequence"
