@@ -20,7 +20,6 @@ M1' = g M1 + o; the variance M2 - M1^2 scales with the square of the light and t
 Nothing here is in Schied et al. 2017; the gradient's normalisation is that of A-SVGF (Schied et al. 2018) in other clothes.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -29,14 +28,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from svgf_jax.color import largest_luminance, luminance_of_planes
+from svgf_jax.cells import Color, Pixels, from_centre, over_cells
+from svgf_jax.color import luminance_of_planes
 from svgf_jax.edges import Guides, depth_gradient, geometry_exponent, guides_of
 from svgf_jax.sampling import (
-    Planes,
     add_margin,
     in_strips,
     planes,
-    split_rows,
     square_offsets,
     stack_planes,
     sum_over_taps,
@@ -46,24 +44,10 @@ from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
 GAIN_LEVELS = 3  # a-trous levels on the grid of cells: reach of +-14 cells
 OFFSET_LEVELS = 1  # +-2 cells
 LARGEST_GAIN = 50.0
-STRIP_CELLS = 4  # rows of cells whose pixels are in hand at once: the fastest of 1 to 16 at 1920 pixels width
 _OFFSETS = square_offsets(2)
 _B3 = np.array([1, 4, 6, 4, 1]) / 16.0  # the B3 spline
 _DARK = 1e-6  # mean luminance below which a ratio means nothing
 _TINY = 1e-12
-
-Color = tuple[Array, ...]  # red, green, blue
-
-
-class Pixels(NamedTuple):
-    """What is compared, and what of each pixel says with whom: trees of planes; `known` is 1 where there is history."""
-
-    guides: Guides
-    slope: tuple[Array, Array]
-    known: Array
-    current: tuple[Color, ...]
-    history: tuple[Color, ...]
-    moments: tuple[tuple[Array, ...], ...]
 
 
 class Cells(NamedTuple):
@@ -165,51 +149,17 @@ def follow_light(
         tuple(planes(signal) for signal in previous.illumination),
         tuple(planes(signal) for signal in previous.moments),
     )
-    cells, sums = _over_cells(partial(_gather, size=size, scalars=scalars), pixels, size=size)
+    cells, sums = over_cells(partial(_gather, size=size, scalars=scalars), pixels, size=size)
     corrections = _judge(cells, sums, size=size, scalars=scalars)
     around = add_margin(Around(cells.guides, (cells.weight > _TINY).astype(frame.depth.dtype), corrections), 1, 1)
-    corrected = _over_cells(partial(_apply, size=size, scalars=scalars), pixels._replace(current=()), around, size=size)
+    corrected = over_cells(partial(_apply, size=size, scalars=scalars), pixels._replace(current=()), around, size=size)
     light, moments, change = zip(*corrected, strict=True)
     return previous._replace(illumination=stack_planes(light), moments=stack_planes(moments), change=jnp.stack(change))
 
 
-def _over_cells(function: Callable[..., Planes], pixels: Pixels, around: Planes = None, *, size: int) -> Planes:
-    """`function(pixels, around)` of a strip of cells after the other, so that all stays in the cache.
-
-    It gets the pixels as *phases* `[size^2, rows, w]`: entry a * size + b holds pixel (a, b) of every cell, 0 beyond the image; and
-    of `around`, planes of cells with a margin of 1, `[rows + 2, w + 2]`. It returns planes of cells `[rows, w]`, or phases again.
-    """
-    height, width = pixels.known.shape
-    down, across = -(-height // size), -(-width // size)
-    count, rows = split_rows(down, across, STRIP_CELLS)
-    below = count * rows - down
-    around = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), around)
-
-    def split(plane: Array) -> Array:
-        padded = jnp.pad(plane, ((0, (down + below) * size - height), (0, across * size - width)))
-        return padded.reshape(count, rows, size, across, size)
-
-    def join(found: Array) -> Array:
-        if found.ndim == 2:
-            return found
-        return found.reshape(size, size, rows, across).transpose(2, 0, 3, 1).reshape(rows * size, across * size)
-
-    def strip(given: tuple[Array, Pixels]) -> Planes:
-        first, pixels = given
-        phases = jax.tree.map(lambda a: a.transpose(1, 3, 0, 2).reshape(size * size, rows, across), pixels)
-        near = jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, first, rows + 2), around)
-        return jax.tree.map(join, function(phases, near))
-
-    strips = jnp.arange(count, dtype=jnp.int32) * rows, jax.tree.map(split, pixels)
-    found = lax.map(jax.checkpoint(strip, prevent_cse=False), strips)  # type: ignore[arg-type]
-    crop = lambda a: a[:down] if a.shape[1] == across else a[:height, :width]  # noqa: E731
-    return jax.tree.map(lambda a: crop(a.reshape(-1, a.shape[-1])), found)
-
-
-def _from_centre(size: int) -> np.ndarray:
-    """Offsets (dy, dx) of a cell's pixels from its central one, `[size^2, 2]`, in the order of the phases."""
-    reach = np.arange(size) - size // 2
-    return np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
+def _brightest(dtype) -> float:
+    """More light than this is not judged: what is made of fourth powers of it, derivatives too, stays finite."""
+    return float(jnp.finfo(dtype).max) ** 0.25
 
 
 def _weight(p: Guides, q: Guides, slope: tuple[Array, Array], dy: Array, dx: Array, scalars: Params) -> Array:
@@ -229,7 +179,7 @@ def _gather(pixels: Pixels, _: None, *, size: int, scalars: Params) -> tuple[Cel
     guides, slope, known, current, history, moments = pixels
     centre = (size // 2) * (size + 1)
     cell_guides, cell_slope = jax.tree.map(lambda a: a[centre], (guides, slope))
-    distance = jnp.asarray(_from_centre(size), known.dtype)
+    distance = jnp.asarray(from_centre(size), known.dtype)
 
     def add(sums, phase):
         q, with_history, colors, (dy, dx) = phase
@@ -248,9 +198,10 @@ def _gather(pixels: Pixels, _: None, *, size: int, scalars: Params) -> tuple[Cel
 
 
 def _compare(current: Color, history: Color, moments) -> Sums:
-    current, history = jax.tree.map(lambda c: jnp.minimum(c, largest_luminance(c.dtype)), (current, history))
+    most = _brightest(moments[0].dtype)
+    current, history = jax.tree.map(lambda c: jnp.minimum(c, most), (current, history))
     l, prev_l = luminance_of_planes(*current), luminance_of_planes(*history)  # noqa: E741
-    noise = jnp.maximum(moments[1] - moments[0] * moments[0], 0.0)
+    noise = jnp.clip(moments[1] - moments[0] * moments[0], 0.0, most * most)
     return Sums(current, history, l * l, l * prev_l, prev_l * prev_l, noise)
 
 
@@ -376,7 +327,7 @@ def _ratio(current: Array, previous: Array, scale: Array, significance: Array) -
 def _apply(pixels: Pixels, around: Around, *, size: int, scalars: Params):
     """Bring the corrections to the pixels, from the 2 x 2 cells whose central pixels surround each."""
     rows, columns = pixels.known.shape[1:]
-    offset = _from_centre(size)
+    offset = from_centre(size)
     first = np.where(offset < 0, -1, 0)  # of the two cells along an axis, relative to the pixel's own
     fraction = offset / size - first
     corners = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
@@ -407,13 +358,16 @@ def _apply(pixels: Pixels, around: Around, *, size: int, scalars: Params):
 
 def _correct(color: Color, moments: tuple[Array, Array], total: Correction, divisor: Array):
     c = jax.tree.map(lambda t: t / divisor, total)
-    most = largest_luminance(divisor.dtype)
-    corrected = tuple(
-        jnp.clip(g * h + o, 0.0, jnp.maximum(h, most)) for g, h, o in zip(c.gain, color, c.offset, strict=True)
-    )
+    most = _brightest(divisor.dtype)
+    corrected = tuple(_within(g, h, o, most) for g, h, o in zip(c.gain, color, c.offset, strict=True))
     first, second = moments
-    variance = jnp.minimum(c.keep * jnp.maximum(second - first * first, 0.0) + c.variance, most * most)
-    first = jnp.clip(c.luminance_gain * first + luminance_of_planes(*c.offset), 0.0, most)
+    noise = _within(c.keep, jnp.maximum(second - first * first, 0.0), c.variance, most * most)
+    first = _within(c.luminance_gain, first, luminance_of_planes(*c.offset), most)
     before, after = (jnp.minimum(luminance_of_planes(*rgb), most) for rgb in (color, corrected))
     change = (after - before) / jnp.maximum(jnp.maximum(after, before), _TINY)
-    return corrected, (first, variance + first * first), change
+    return corrected, (first, noise + first * first), change
+
+
+def _within(gain: Array, past: Array, offset: Array, most: float) -> Array:
+    """gain past + offset, from 0 to `most`; what is more already stays as it is."""
+    return jnp.where(past < most, jnp.clip(gain * jnp.minimum(past, most) + offset, 0.0, most), past)

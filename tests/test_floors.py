@@ -25,7 +25,7 @@ FLOORS = [
         "cameras",
         "warping",
     },
-    {"renderers"},
+    {"renderers", "cells"},
     {"variance", "atrous", "adaptation", "roles", "reflections", "preview", "joint_bilateral", "outliers", "matrices"},
     {"advising", "planes", "camera_files", "geometry"},
     {"assembly"},
