@@ -13,7 +13,7 @@ from bridge import AS_USERS, to_frame
 
 from svgf_jax import SvgfError, exr, streaming
 from svgf_jax.baselines import baseline_denoise, baseline_init, baseline_step, filter_alone, one_signal
-from svgf_jax.commands import denoise, settings
+from svgf_jax.commands import settings
 from svgf_jax.frames import load_sequence, open_source
 from svgf_jax.joint_bilateral import gaussian_filter
 from svgf_jax.methods import METHODS, method
@@ -211,7 +211,7 @@ def test_resumed_is_the_same_bit_for_bit(tmp_path):
 
 
 def test_the_command_knows_every_method():
-    assert set(typing.get_args(denoise.Method)) == {"svgf", *METHODS}
+    assert set(typing.get_args(settings.Method)) == {"svgf", *METHODS}
 
 
 @pytest.mark.parametrize(

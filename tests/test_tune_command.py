@@ -115,7 +115,8 @@ def test_tunes_validates_reports(shots, tuned):
     maps = exr.read(folder / "maps" / "sensitivity.exr")
     assert set(maps.channels) == {"error", "slope.alpha", "slope.sigma_luminance", "slope.max_history"}
     html = (folder / "report.html").read_text()
-    assert "http" not in html.replace("http://www.w3.org", "")  # self-contained
+    assert "http:" not in html.replace("http://www.w3.org", "")  # self-contained
+    assert "https:" not in html
     for word in ("Loss", "Parameters", "undetermined", "Before and after", "Frame by frame", "Profiles", "<svg"):
         assert word in html
     assert not list(folder.glob(".*progress*"))

@@ -146,6 +146,8 @@ def command(
     held = [
         shot_of_files(n, r, frames=validate_frames, **opened) for n, r in zip(validate, validate_reference, strict=True)
     ]
+    opening = [note for shot in (*references, *seconds, *held) for note in shot.notes]
+    terminal.warn(dict.fromkeys(opening))  # before a frame is read, which may fail
     references, seconds, held = (list(map(with_doubts, group)) for group in (references, seconds, held))
     shots: list[Shot] = seconds or references
     if second:
@@ -175,7 +177,8 @@ def command(
         "versions": versions(),
     }
     nobody: Any = lambda heard: None  # noqa: E731
-    terminal.warn(dict.fromkeys(note for shot in (*references, *seconds, *held) for note in shot.notes))
+    doubts = dict.fromkeys(note for shot in (*references, *seconds, *held) for note in shot.notes)
+    terminal.warn(note for note in doubts if note not in opening)
     length = sum(shot.length for shot in shots)
     me = Process()
     with _terminated_as_interrupted(), ExitStack() as stack:
