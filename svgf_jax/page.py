@@ -122,8 +122,11 @@ def plot(
     marked: bool = True,
     follow: bool = False,
     log: bool = False,
+    named: bool = False,
 ) -> str:
-    """A figure with an SVG of lines; "" where no point is finite.
+    """A figure with an SVG of lines; "" where no point is finite. Several lines have a legend, and one alone where `named`.
+
+    The first of several is grey, for what the others are compared with; one alone has the colour of a result.
 
     `frames`: x is the number of one of these frames, and where `marked` a line shows which one the viewer shows. `follow`:
     only the lines of the two pictures that it compares are there. `log`: y is shown as its logarithm, and what is not
@@ -167,16 +170,17 @@ def plot(
         parts.append(f'<text x="{across(x):.1f}" y="{height - 7}" text-anchor="middle">{x:.6g}</text>')
     if frames and marked:
         parts.append(f'<line class="now" x1="{left}" x2="{left}" y1="{top}" y2="{height - bottom}"/>')
+    first = int(len(drawn) == 1)
     for i, (name, own) in enumerate(drawn):
         at = [(f"{across(x):.1f}", f"{down(y):.1f}", f"{name} {x:.6g}: {10**y if log else y:.5g}") for x, y in own]
         path = " ".join(f"{x},{y}" for x, y, _ in at)
         dots = "".join(f'<circle cx="{x}" cy="{y}" r="2.2"><title>{escape(text)}</title></circle>' for x, y, text in at)
-        style = "" if follow else f' class="k{i % 4}"'
+        style = "" if follow else f' class="k{(i + first) % 4}"'
         parts.append(
             f'<g data-name="{escape(name)}"{style}><polyline points="{path}"/>{dots if len(own) <= 200 else ""}</g>'
         )
-    named = [] if follow or len(drawn) < 2 else [name for name, _ in drawn]
-    keys = "".join(f'<span class="key k{i % 4}">{escape(name)}</span>' for i, name in enumerate(named))
+    told = [] if follow or (len(drawn) < 2 and not named) else [name for name, _ in drawn]
+    keys = "".join(f'<span class="key k{(i + first) % 4}">{escape(name)}</span>' for i, name in enumerate(told))
     style = ' class="follow"' if follow else ""
     return f"<figure{style}><figcaption>{escape(title)}{keys}</figcaption>{''.join(parts)}</svg></figure>"
 

@@ -85,13 +85,14 @@ def run_page(run: Run, summary: Summary, *, repairs: Callable[[Mapping[str, int]
     shown, scores = _run_frames(run, done)
     known = [figures.get(number, {}) for _, number, _ in done]
     x = [number for _, number, _ in done]
-    seconds = [_number(one.get("seconds")) for one in known]
+    each = [_number(one.get("seconds")) for one in known]
+    seconds = _from_start(each)
     counts = [one.get("counts") for one in known]
     repaired = [math.nan if one is None else float(sum(one.values())) for one in counts]
     length = [_number(one.get("history")) for one in known]
     curves = [
-        *_curves(x, scores, {"denoised": _values(scores, "psnr")} | _noisy_line(shown)),
-        page.plot([Line("seconds", x, seconds)], title="seconds a frame (the first compiles)", frames=x, log=True),
+        *_curves(x, scores, "denoised", _noisy_line(shown)),
+        page.plot([Line("seconds", x, seconds)], title="done after, seconds (the first compiles)", frames=x),
         page.plot([Line("pixels", x, repaired)], title="pixels repaired", frames=x),
         page.plot([Line("frames", x, length)], title="mean history length, frames", frames=x),
     ]
@@ -111,13 +112,14 @@ def run_page(run: Run, summary: Summary, *, repairs: Callable[[Mapping[str, int]
         (number, one.get("status", UNKNOWN), *_score_cells(score), *_cells(times, count, mean))
         for number, one, score, times, count, mean in zip(x, known, scores, seconds, repaired, length, strict=True)
     ]
-    heads = ("frame", "status", "PSNR dB", "temporal error", "seconds", "repaired", "mean history")
+    heads = ("frame", "status", "PSNR dB", "temporal error", "done after, s", "repaired", "mean history")
     after = f", after {warmup} to warm up" if warmup else ""
     before = f", {summary.resumed_at} of them by an earlier run" if summary.resumed_at else ""
     told = [
         ("frames", f"{len(done)} of {wanted}{before}{after}"),
         ("device", summary.device or "nothing was left to compute"),
         ("seconds, this run", f"{summary.seconds:.1f}"),
+        *_speed(each),
         ("pictures", _pictures_of(shown, len(done))),
     ]
     return page.document(
@@ -162,9 +164,14 @@ def compare_page(
                 pictures = {"before": read_radiance(before[pair.number])} | pictures
             shown.append(shown_frame(pair.number, pictures, target, {"result": maps}, len(chosen)))
     x = [pair.number for pair in pairs]
-    curves = _curves(x, scores, {"result": _values(scores, "psnr")} | _noisy_line(shown, "before"))
+    old = [pair for pair in pairs if pair.number in chosen and pair.number in before]
+    read = ((read_radiance(before[pair.number]), read_radiance(pair.reference)) for pair in old)
+    earlier = {pair.number: score for pair, score in zip(old, metrics.score_frames(read), strict=True) if score}
+    if len(old) < len(pairs):  # not consecutive
+        earlier = {number: score._replace(temporal=math.nan) for number, score in earlier.items()}
+    curves = _curves(x, scores, "result", {"before": earlier} if earlier else {})
     curves += [
-        page.plot([Line(name, x, _values(scores, field))], title=name, frames=x)
+        page.plot(_lines(x, scores, "result", field, {"before": earlier}), title=name, frames=x, named=True)
         for field, name in (("relmse", "relMSE"), ("ssim", "SSIM"), ("flip", "HDR-FLIP"))
     ]
     told = [
@@ -297,21 +304,57 @@ def _recorded(attributes: Mapping[str, Any]) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _curves(x: Sequence[int], scores: Sequence[metrics.Scores | None], psnr: Mapping[str, Any]) -> list[str]:
-    """PSNR and temporal error, where there are references."""
+def _curves(
+    x: Sequence[int],
+    scores: Sequence[metrics.Scores | None],
+    name: str,
+    others: Mapping[str, Mapping[int, metrics.Scores]],
+) -> list[str]:
+    """PSNR and temporal error, where there are references; `others`: the scores of what it is compared with, by frame number."""
     if not any(score is not None for score in scores):
         return []
-    lines = [Line(name, *(of if isinstance(of, tuple) else (x, of))) for name, of in psnr.items()]
     return [
-        page.plot(lines[::-1], title="PSNR, dB", frames=x),
-        page.plot([Line("", x, _values(scores, "temporal"))], title="temporal error", frames=x),
+        page.plot(_lines(x, scores, name, field, others), title=title, frames=x, named=True)
+        for field, title in (("psnr", "PSNR, dB"), ("temporal", "temporal error"))
     ]
 
 
-def _noisy_line(shown: Sequence[Shown], name: str = "noisy") -> dict[str, tuple[list[int], list[float]]]:
+def _lines(
+    x: Sequence[int],
+    scores: Sequence[metrics.Scores | None],
+    name: str,
+    field: str,
+    others: Mapping[str, Mapping[int, metrics.Scores]],
+) -> list[Line]:
+    """What it is compared with first; lines without a finite value are left out."""
+    lines = [Line(other, list(of), _values(list(of.values()), field)) for other, of in others.items()]
+    lines.append(Line(name, x, _values(scores, field)))
+    return [line for line in lines if any(map(math.isfinite, line.y))]
+
+
+def _noisy_line(shown: Sequence[Shown]) -> dict[str, dict[int, metrics.Scores]]:
     """The PSNR before the filter, of the frames that are shown."""
-    known = [(frame.number, frame.psnr[name]) for frame in shown if name in frame.psnr]
-    return {name: ([number for number, _ in known], [value for _, value in known])} if known else {}
+    nothing = [math.nan] * (len(metrics.Scores._fields) - 1)
+    known = {frame.number: metrics.Scores(frame.psnr["noisy"], *nothing) for frame in shown if "noisy" in frame.psnr}
+    return {"noisy": known} if known else {}
+
+
+def _from_start(seconds: Sequence[float]) -> list[float]:
+    """When each frame was done, by how long after the one before: reading, filtering and writing overlap, so that says little."""
+    total = np.nancumsum(seconds)
+    return [math.nan if math.isnan(one) else float(at) for one, at in zip(seconds, total, strict=True)]
+
+
+def _speed(seconds: Sequence[float]) -> list[tuple[str, str]]:
+    """The first frame, which compiles, and the mean of the others."""
+    known = [one for one in seconds if math.isfinite(one)]
+    if len(known) < 2:
+        return []
+    rest = sum(known[1:]) / (len(known) - 1)
+    return [
+        ("seconds, first frame", f"{known[0]:.2f}, compilation included"),
+        ("seconds a frame, the others", f"{rest:.3g}"),
+    ]
 
 
 def _values(scores: Sequence[metrics.Scores | None], field: str) -> list[float]:

@@ -272,3 +272,27 @@ def test_held_frames_are_shown_without_an_input(tmp_path):
         ["denoised"],
         ["denoised", "noisy"],
     ]
+
+
+def test_curves_have_colours_and_names_by_what_they_are():
+    """Grey is what a result is compared with; a result alone has its colour, and its name where that tells something."""
+    before, after = (metrics.Scores(psnr, 0.1, 0.9, float("nan"), float("nan")) for psnr in (20.0, 30.0))
+    lines = report._lines([1], [after], "result", "psnr", {"before": {1: before}})
+    both = page.plot(lines, title="t", named=True)
+    assert '<span class="key k0">before</span><span class="key k1">result</span>' in both
+    alone = page.plot(report._lines([1], [after], "result", "temporal", {"before": {1: before}}), title="t", named=True)
+    assert alone == ""  # no temporal error of one frame
+    alone = page.plot(lines[1:], title="t", named=True)
+    assert '<span class="key k1">result</span>' in alone
+    assert 'data-name="result" class="k1"' in alone
+    assert "key" not in page.plot(lines[1:], title="t")
+
+
+def test_frames_are_done_one_after_the_other():
+    unknown = float("nan")
+    assert report._from_start([5.0, 0.5, unknown, 0.25])[::3] == [5.0, 5.75]
+    assert report._speed([5.0, 0.5, unknown, 0.25]) == [
+        ("seconds, first frame", "5.00, compilation included"),
+        ("seconds a frame, the others", "0.375"),
+    ]
+    assert report._speed([5.0]) == []
