@@ -18,7 +18,7 @@ from svgf_jax.commands.demo import demo
 from svgf_jax.commands.denoise import denoise
 from svgf_jax.commands.inspect import inspect
 from svgf_jax.commands.params import diff, list_, show
-from svgf_jax.commands.project import use_project
+from svgf_jax.commands.project import located, use_project
 from svgf_jax.commands.video import video
 from svgf_jax.types import SvgfError
 
@@ -71,7 +71,8 @@ def launch(
     use_project(app, config, commands=app)
     limits.set_max_pixels(max_pixels)
     try:
-        return app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+        with located(app):
+            return app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
     finally:
         app.config = ()
         limits.set_max_pixels(None)

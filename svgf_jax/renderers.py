@@ -113,8 +113,10 @@ def load_table(name: str) -> Table:
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if path.parent == FOLDER and path.stem not in renderer_names():
         known = ", ".join(renderer_names())
+        hint = ". Did you mean cycles?" if name.lower() == "blender" else suggest(name, renderer_names())
         raise SvgfError(
-            f"no renderer is called {name!r}; there are {known}, or give a table of your own: shot/mine.toml."
+            f"no renderer is called {name!r}{hint or '.'} There are {known}, or give a table of your own: "
+            "shot/mine.toml."
         )
     return _load(path)
 

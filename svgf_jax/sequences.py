@@ -117,7 +117,8 @@ def companion(
     """
     text = os.fspath(pattern)
     near = os.path.join(os.path.dirname(sequence.name), text)
-    text = next((place for place in (text, near) if os.path.exists(place) or _match(place)[0]), text)
+    missing = text if os.path.dirname(text) else near
+    text = next((place for place in (text, near) if os.path.exists(place) or _match(place)[0]), missing)
     if os.path.isfile(text):
         return sequence._replace(files=tuple((number, text) for number, _ in sequence.files), name=text, padding=0)
     other = find_sequence(text, missing="hold", prefer=prefer)
@@ -198,7 +199,8 @@ def _pick(folder: str, prefer: tuple[str, ...]) -> str:
     if len(choice) == 1:
         return os.path.join(folder, choice[0])
     if not choice:
-        raise SvgfError(f"{folder}: no EXR files in this folder. {_near(os.path.join(folder, 'x'))}")
+        held = _near(os.path.join(folder, "x")).removeprefix(f"The folder {folder} ")
+        raise SvgfError(f"{folder}: wanted a folder of EXR files; this one {held}")
     raise SvgfError(
         f"{folder}: several sequences are here: {', '.join(names)}. Say which: {os.path.join(folder, names[0])}"
     )
@@ -229,7 +231,7 @@ def _near(pattern: str) -> str:
     if not names:
         others = [entry for entry in _list(folder) if not entry.startswith(".")][:5]
         return f"The folder {folder or '.'} holds " + (
-            f"no EXR files, but {', '.join(others)}." if others else "no files."
+            f"no EXR files, but {', '.join(others)}." if others else "nothing."
         )
     close = difflib.get_close_matches(name, names, n=5, cutoff=0.0)
     return f"In {folder or '.'} there is {', '.join(close)}" + (" ..." if len(names) > len(close) else ".")

@@ -207,3 +207,30 @@ def test_a_shell_gets_its_completion(shell, capsys):
         word in script
         for word in ("svgf-jax", "denoise", "--checkpoint-every" if shell != "fish" else "checkpoint-every")
     )
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "said"),
+    [
+        ('[denoise]\npreset = "papr"\n', 2, "no preset 'papr'"),
+        ("[all]\n\nset = { alhpa = 0.3 }\n", 3, "no parameter 'alhpa'"),
+        ('[all.set]\nalpha = 0.3\nsigma_normal = "x"\n', 3, "sigma_normal=x; wanted a number"),
+        ('[all]\npreset = "paper"\nset = ["alpha=-3"]\n', 3, "alpha = -3.0; wanted"),
+    ],
+)
+def test_a_wrong_value_is_told_with_its_line(tmp_path, monkeypatch, capsys, text, line, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "svgf-jax.toml").write_text(text)
+    error = run(capsys, "denoise", "shot", "-o", "out")[2].splitlines()[-1]
+    assert error.startswith(f"svgf-jax: {tmp_path / 'svgf-jax.toml'}:{line}: ")
+    assert said in error
+    error = run(capsys, "denoise", "shot", "-o", "out", "--config", "none")[2]
+    assert "svgf-jax.toml:" not in error
+
+
+def test_a_pattern_without_a_folder_is_looked_for_beside_the_frames(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_shot(tmp_path / "shot", [1])
+    (tmp_path / "svgf-jax.toml").write_text('[all]\nfile = { normal = "nrm_####.exr" }\n')
+    error = run(capsys, "inspect", "shot")[2]
+    assert f"{Path('shot') / 'nrm_####.exr'}: no such frames. In shot there is" in error

@@ -88,7 +88,9 @@ def test_what_is_wrong_in_a_table_is_told_with_its_line(tmp_path, text):
 
 
 def test_renderers_that_are_not_known():
-    with pytest.raises(SvgfError, match=r"no renderer is called 'blender'; there are native, arnold, bmfr, cycles"):
+    with pytest.raises(
+        SvgfError, match=r"called 'blender'\. Did you mean cycles\? There are native, arnold, bmfr, cycles"
+    ):
         load_table("blender")
 
 

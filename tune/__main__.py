@@ -8,7 +8,7 @@ from cyclopts import App, CycloptsError, Group, Parameter
 
 from svgf_jax import SvgfError, __version__
 from svgf_jax.cli import app as svgf_jax
-from svgf_jax.commands.project import use_project
+from svgf_jax.commands.project import located, use_project
 from tune.command import command
 
 app: App = App(
@@ -39,7 +39,8 @@ def launch(
         return 0
     use_project(app, config, commands=svgf_jax, table="tune")
     try:
-        return app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+        with located(app):
+            return app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
     finally:
         app.config = ()
 

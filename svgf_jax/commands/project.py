@@ -12,6 +12,7 @@ set = { alpha = 0.4 }
 import os
 import types
 from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin
@@ -60,7 +61,21 @@ def use_project(app: App, given: str, *, commands: App, table: str | None = None
         for name in names:
             if name not in NOT_OF_ALL:
                 known |= dict.fromkeys(_options(commands[name].assemble_argument_collection()))
-    app.config = (partial(_apply, file, () if table is None else (table,), tuple(known)),)
+    above = () if table is None else (table,)
+    app.config = (partial(_apply, file, above, tuple(known), used=[]),)
+
+
+@contextmanager
+def located(app: App) -> Iterator[None]:
+    """What is wrong with a value of the project file is told with its line: in errors that quote it."""
+    try:
+        yield
+    except SvgfError as error:
+        for config in app.config or ():
+            for where, words in getattr(config, "keywords", {}).get("used", ()):
+                if any(word in str(error) for word in words):
+                    raise SvgfError(f"{where}: {error}") from None
+        raise
 
 
 def nearest(folder: Path) -> Path | None:
@@ -80,11 +95,16 @@ def _apply(
     _: App,
     commands: tuple[str, ...],
     arguments: ArgumentCollection,
+    *,
+    used: list[tuple[str, tuple[str, ...]]],
 ) -> None:
-    """Give every option that the command line leaves open what the file says, and tell which."""
+    """Give every option that the command line leaves open what the file says, and tell which.
+
+    `used` gets the line of each value, and how errors quote it (`located`).
+    """
     options = _options(arguments)
     taken = {name for name, argument in options.items() if argument.tokens}
-    used = []
+    told = []
     for keys, table in _tables(file, (*above, *commands)):
         hidden = taken | {other for group in APART if group & taken for other in group}
         for name, value in table.items():
@@ -106,10 +126,14 @@ def _apply(
                 continue
             for index, text in enumerate(texts):
                 options[name].append(Token(keyword=f"--{name}", value=text, source=where, index=index))
-            used.append(name)
+                key, equals, given = text.partition("=")
+                at = place(file, *keys, name, key) if equals and isinstance(value, dict) else where
+                quoted = (repr(text), repr(key), repr(given), f"{key} = ") if equals else (repr(text),)
+                used.append((at, (f"--{name} {text}", *quoted)))
+            told.append(name)
             taken.add(name)
-    if used:
-        terminal.tell(f"{file.path}: {', '.join(used)}")
+    if told:
+        terminal.tell(f"{file.path}: {', '.join(told)}")
 
 
 def _tables(file: TomlFile, commands: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], dict[str, Any]]]:
