@@ -5,8 +5,8 @@
     python tests/bench/denoisers.py --table                                        (what was measured, as Markdown)
 
 A FOLDER holds frame_####.exr and ref_####.exr. PSNR, relMSE, FLIP and temporal error are means over all frames, as
-`svgf-jax compare` measures them; seconds are the median of a frame, compilation and reading left out. Open Image Denoise sees each
-frame alone: color, albedo and normal (`oidn`), and with the guides declared clean (`oidn clean`). Results are added to
+`svgf-jax compare` measures them; seconds are processor time (all cores),
+the median of a frame, compilation and reading left out. Open Image Denoise sees each frame alone: color, albedo and normal (`oidn`), and with the guides declared clean (`oidn clean`). Results are added to
 tests/bench/denoisers.json.
 """
 
@@ -23,7 +23,7 @@ from svgf_jax import Config, Frame, Params, init, load_reference, open_source, p
 from svgf_jax.metrics import mean_scores, score_frames
 
 RESULTS = Path(__file__).with_suffix(".json")
-Denoiser = Callable[[Iterator[Frame]], Iterator[tuple[np.ndarray, float]]]  # (image, seconds) of each frame
+Denoiser = Callable[[Iterator[Frame]], Iterator[tuple[np.ndarray, float]]]  # (image, processor seconds) of each frame
 
 
 def svgf(params: Params, config: Config, *, alone: bool = False) -> Denoiser:
@@ -36,10 +36,10 @@ def svgf(params: Params, config: Config, *, alone: bool = False) -> Denoiser:
             if history is None:
                 history = init(frame)
                 jax.block_until_ready(step(history, frame, params=leaves, config=config))  # compiles
-            began = time.monotonic()
+            began = time.process_time()
             history = init(frame) if alone else history
             history, output = jax.block_until_ready(step(history, frame, params=leaves, config=config))
-            yield np.asarray(output.image), time.monotonic() - began
+            yield np.asarray(output.image), time.process_time() - began
 
     return run
 
@@ -62,9 +62,9 @@ def oidn(*, clean: bool) -> Denoiser:
             surface = (np.asarray(frame.object_id) != -1)[..., None]
             albedo = np.where(surface, np.clip(frame.albedo[0], 0, 1), np.clip(frame.emission, 0, 1))
             guides = {"albedo": np.float32(albedo), "normal": np.float32(frame.normal)}
-            began = time.monotonic()
+            began = time.process_time()
             image = pyoidn.denoise(beauty(frame), **guides, hdr=True, clean_aux=clean, quality="high")
-            yield np.asarray(image), time.monotonic() - began
+            yield np.asarray(image), time.process_time() - began
 
     return run
 
