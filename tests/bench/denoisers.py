@@ -4,10 +4,10 @@
     python tests/bench/denoisers.py FOLDER... [--only paper,adaptive] [--frames 0-7] [--no-flip]
     python tests/bench/denoisers.py --table                                        (what was measured, as Markdown)
 
-A FOLDER holds frame_####.exr and ref_####.exr. PSNR, relMSE, FLIP and temporal error are means over all frames, as
-`svgf-jax compare` measures them; seconds are processor time (all cores),
-the median of a frame, compilation and reading left out. Open Image Denoise sees each frame alone: color, albedo and normal (`oidn`), and with the guides declared clean (`oidn clean`). Results are added to
-tests/bench/denoisers.json.
+A FOLDER holds frame_####.exr and ref_####.exr. PSNR, relMSE, FLIP and temporal error are means over all frames, as `svgf-jax
+compare` measures them; seconds are processor time (all cores), the median of a frame, compilation and reading left out. Open
+Image Denoise sees each frame alone: color, albedo and normal (`oidn`), and with the guides declared clean (`oidn clean`).
+Results are added to tests/bench/denoisers.json.
 """
 
 import argparse
