@@ -144,7 +144,8 @@ def _light(facts: Facts, renderer: str) -> Iterator[Finding]:
         text = f"{count} pixels in {_frames(facts)} have more emission than the beauty that should contain it."
         yield Finding("warning", "emission", text, remedy("excess", renderer))
     if facts.halves.clipped:
-        text = f"{facts.halves.clipped} pixels are as bright as half float can be (65504): their light is cut off."
+        one = facts.halves.clipped == 1
+        text = f"{facts.halves.clipped} pixel{' is' if one else 's are'} as bright as half float can be (65504): light is cut off."
         yield Finding("warning", "half float", text, remedy("half", renderer))
 
 

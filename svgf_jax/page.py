@@ -244,6 +244,12 @@ def viewer(frames: Sequence[Shown], *, left: str, right: str, legends: Mapping[s
     shown = [frame._replace(psnr={})._asdict() | {"notes": notes} for frame, notes in zip(frames, told, strict=True)]
     data = json.dumps({"frames": shown, "legends": legends}).replace("<", "\\u003c")
     last = len(frames) - 1
+    maps = {name for frame in frames for own in frame.maps.values() for name in own}
+    lack = (
+        '<p class="soft">No FLIP maps: they need the extra flip.</p>'
+        if "difference" in maps and "FLIP" not in maps
+        else ""
+    )
     return f"""
 <div class="row">{choice("left", left)}{choice("right", right)}</div>
 <div class="view">
@@ -259,7 +265,7 @@ def viewer(frames: Sequence[Shown], *, left: str, right: str, legends: Mapping[s
 </div>
 <p class="soft">Drag in the picture, or use the arrow keys on either slider; <kbd>,</kbd> and <kbd>.</kbd> step through the
 frames anywhere.</p>
-<h2 id="maps-of"></h2><div class="maps" id="maps"></div>
+<h2 id="maps-of"></h2><div class="maps" id="maps"></div>{lack}
 <script type="application/json" id="frames">{data}</script>
 """
 

@@ -1,6 +1,6 @@
 """What renderers call their channels and files, and what they mean by the numbers: one table a renderer, `tables/NAME.toml`.
 
-A table is data. Its keys (all but `title` may be absent):
+A table is data. Its keys (all may be absent):
 
 - `[detect]`: `channels`, `attributes` (of the header) and `files` (in the frame's folder); the table whose lines match most is it.
 - `layered`: channels have a layer's name in front ("ViewLayer.Combined.R").

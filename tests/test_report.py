@@ -296,3 +296,9 @@ def test_frames_are_done_one_after_the_other():
         ("seconds a frame, the others", "0.375"),
     ]
     assert report._speed([5.0]) == []
+
+
+def test_a_page_without_flip_says_so():
+    for names, lacks in ((("difference",), True), (("difference", "FLIP"), False), (("variance",), False)):
+        shown = [page.Shown(1, {"result": ""}, {"result": dict.fromkeys(names, "")})]
+        assert ("No FLIP maps" in page.viewer(shown, left="result", right="result", legends={})) == lacks

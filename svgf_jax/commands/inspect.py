@@ -1,5 +1,6 @@
 """`svgf-jax inspect`."""
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,6 +12,8 @@ from svgf_jax.commands.completing import PRESET
 from svgf_jax.commands.settings import INPUT, Flag, Reading, Repeated
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from svgf_jax.findings import Finding
     from svgf_jax.geometry import Fit
     from svgf_jax.inspection import Facts
@@ -73,6 +76,17 @@ def inspect(
 def _print(facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str, run: str) -> None:
     """Sections of labels and texts, then what to mend, then the verdict. Nothing is taken for markup. `run`: what would filter."""
     from rich.console import Console
+
+    console = Console(highlight=False)
+    if not console.is_terminal:  # piped: no blanks at the ends of lines
+        with console.capture() as captured:
+            _draw(console, facts, findings, conclusion, run)
+        sys.stdout.write("".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))
+    else:
+        _draw(console, facts, findings, conclusion, run)
+
+
+def _draw(console: "Console", facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str, run: str) -> None:
     from rich.padding import Padding
     from rich.table import Table
     from rich.text import Text
@@ -80,7 +94,6 @@ def _print(facts: "Facts", findings: "tuple[Finding, ...]", conclusion: str, run
     def shown(text: str, style: str = "") -> Text:
         return Text(terminal.visible(text), style=style)
 
-    console = Console(highlight=False)
     console.print(shown(facts.name, style="bold"))
     sections = [(title, rows) for title, rows in _sections(facts, run) if rows]
     width = max(len(label) for _, rows in sections for label, _ in rows)
@@ -151,7 +164,7 @@ def _channels(facts: "Facts") -> Iterator[tuple[str, str]]:
     stems: dict[str, list[str]] = {}
     for name in facts.scan.unused:
         stems.setdefault(name.rpartition(".")[0], []).append(name)
-    unused = [short_names(tuple(names)) for names in stems.values()]
+    unused = [short_names(tuple(sorted(names, key=lambda name: "RGBAXYZ".find(name[-1])))) for names in stems.values()]
     if unused:
         yield "not used", ", ".join(unused[:10]) + (f" and {len(unused) - 10} more" if len(unused) > 10 else "")
 
