@@ -7,7 +7,7 @@ import pytest
 
 from svgf_jax import SvgfError
 from svgf_jax.demo import sample
-from tune import checkpoint
+from tune import checkpoint, fitting, solver
 from tune.shots import Example, Shot, shot_of_files
 from tune.targets import doubts, likeness, with_doubts
 
@@ -142,3 +142,49 @@ def test_a_checkpoint_that_is_something_else_is_refused(tmp_path):
     np.savez(path, header=np.array({"format": checkpoint.FORMAT}, dtype=object))  # would be unpickled
     with pytest.raises(SvgfError, match="damaged"):
         checkpoint.load(path, None, IDENTITY)
+
+
+def a_fit(n=2):
+    """A descent just begun and its progress after one trial point."""
+    fresh = solver.begin(solver.make_solver("lm"), np.zeros(n))
+    trial = fitting.Iteration(0, 0, 1.0, True, np.ones(n), 1.0)
+    found = (np.eye(n + 1), np.eye(n), 7)
+    return fresh, fitting.Progress(0, fresh, (trial,), 1.0, np.zeros(n), 1.0, found, None, np.ones(1))
+
+
+def test_numbers_of_a_checkpoint_that_are_wrong_are_refused(tmp_path):
+    path, bad = tmp_path / "c.npz", tmp_path / "bad.npz"
+    fresh, progress = a_fit()
+    checkpoint.save(path, progress, IDENTITY)
+    assert checkpoint.load(path, fresh, IDENTITY).best_loss == 1.0
+    with np.load(path) as file:
+        good = dict(file)
+    header = json.loads(str(good["header"]))
+    wrong = [
+        ({"best_y": np.array([0.0, np.nan])}, "best_y is not finite"),
+        ({"losses": np.array([np.nan, 1.0])}, "losses has numbers below 0, or that are none"),
+        ({"losses": np.array([1.0, np.inf])}, "a best loss of inf"),
+        ({"losses": np.array([1.0, -1.0])}, "losses has numbers below 0"),
+        ({"state0": np.full(2, np.inf)}, "state0 is not finite"),
+        ({"state2": np.zeros(3)}, "state2 is float64"),
+        ({"state1": np.zeros(())}, "state1 is float64"),
+        ({"triangle": np.eye(2)}, "triangle is"),
+        ({"rows": np.array(0)}, "rows has numbers below 1"),
+        ({"more": np.zeros(1)}, "it holds best_y"),
+        ({"header": np.array(json.dumps(header | {"start": -1}))}, "start -1"),
+        ({"header": np.array(json.dumps(header | {"endings": [1], "start": 1}))}, "endings"),
+        ({"header": np.array("[" * 100_000)}, "recursion"),
+    ]
+    for change, said in wrong:
+        np.savez(bad, **(good | change))
+        with pytest.raises(SvgfError, match=f"damaged.*{said}"):
+            checkpoint.load(bad, fresh, IDENTITY)
+    for at, value in ((6, 1), (8, 99)):  # encrypted; a method of compression that nobody knows
+        data = bytearray(path.read_bytes())
+        data[at], data[data.index(b"PK\x01\x02") + at + 2] = value, value
+        bad.write_bytes(data)
+        with pytest.raises(SvgfError, match="damaged"):
+            checkpoint.load(bad, fresh, IDENTITY)
+    checkpoint.save(path, a_fit(3)[1], IDENTITY)
+    with pytest.raises(SvgfError, match="damaged"):
+        checkpoint.load(path, fresh, IDENTITY)

@@ -1,7 +1,6 @@
 """A fit on the disk between two iterations, so that it can be resumed bit for bit: numbers only, nothing that is executed."""
 
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -52,12 +51,12 @@ def load(path: Path, fresh: Descent, identity: dict[str, Any]) -> Progress:
     Raises SvgfError: not there, damaged, of another version, or of another fit than `identity`.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            content = {name: stored[name] for name in stored.files}
+        content = _content(path)
         header = json.loads(str(content["header"]))
         if header["format"] != FORMAT:
             raise SvgfError(f"{path}: written by another version of svgf-tune; start anew without --resume")
         _compare(path, header["identity"], json.loads(json.dumps(identity)))
+        _check(content, header, fresh)
         trials = zip(content["trials"], content["values"], strict=True)
         return Progress(
             start=header["start"],
@@ -75,17 +74,50 @@ def load(path: Path, fresh: Descent, identity: dict[str, Any]) -> Progress:
         )
     except FileNotFoundError:
         raise SvgfError(f"{path}: no checkpoint to resume from; start without --resume") from None
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        EOFError,
-        MemoryError,
-        zipfile.BadZipFile,
-    ) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, MemoryError) as error:
         raise SvgfError(f"{path}: damaged ({error}); delete it and start without --resume") from None
+
+
+def _content(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of the file. ValueError, whatever a damaged zip makes of itself (encrypted, a method nobody knows, ...)."""
+    with path.open("rb") as file:
+        try:
+            with np.load(file, allow_pickle=False) as stored:
+                return {name: stored[name] for name in stored.files}
+        except Exception as error:
+            raise ValueError(str(error) or type(error).__name__) from None
+
+
+def _check(content: dict[str, np.ndarray], header: dict[str, Any], fresh: Descent) -> None:
+    """ValueError where the arrays are not what `save` writes of a fit of this size."""
+    n, rows, state = fresh.y.size, len(content["trials"]), arrays(fresh)
+    wanted: dict[str, tuple[str, tuple[int, ...]]] = {
+        "trials": ("float64", (rows, 5)),
+        "values": ("float64", (rows, n)),
+        "losses": ("float64", (2,)),
+        "best_y": ("float64", (n,)),
+        "pixel_weights": ("float64", (content["pixel_weights"].size,)),
+        **{f"state{i}": (str(value.dtype), value.shape) for i, value in enumerate(state)},
+    }
+    if header["found"]:
+        wanted |= {"triangle": ("float64", (n + 1, n + 1)), "scatter": ("float64", (n, n)), "rows": ("int64", ())}
+    if content.keys() != {"header", *wanted} or header["states"] != len(state):
+        raise ValueError(f"it holds {', '.join(sorted(content))}")
+    for name, (dtype, shape) in wanted.items():
+        array = content[name]
+        if array.dtype != dtype or array.shape != shape:
+            raise ValueError(f"{name} is {array.dtype} {array.shape}; wanted {dtype} {shape}")
+        known = array[:, :4] if name == "trials" else array[:0] if name == "losses" else array
+        if not np.isfinite(known).all():  # a loss that is not known yet may be infinite, and the damping
+            raise ValueError(f"{name} is not finite")
+    for name, least in (("losses", 0), ("trials", 0), ("pixel_weights", 0), ("rows", 1)):
+        if name in wanted and not (content[name] >= least).all():  # nan is not
+            raise ValueError(f"{name} has numbers below {least}, or that are none")
+    if bool(header["found"]) != np.isfinite(content["losses"][1]):
+        raise ValueError(f"a best loss of {content['losses'][1]}")
+    start, ended, endings = header["start"], header["ended"], header["endings"]
+    if type(start) is not int or start != len(endings) or not all(isinstance(e, str) for e in [ended or "", *endings]):
+        raise ValueError(f"start {start!r} with the endings {endings!r}")
 
 
 def _compare(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None:
