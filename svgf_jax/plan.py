@@ -1,8 +1,9 @@
 """What a run will write, checked before it starts: output names, collisions, and where a resumed run begins. No JAX."""
 
+import contextlib
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -95,6 +96,33 @@ def part_name(files: Files, warmup: int | None) -> str:
     return "" if warmup is None else f"{files[warmup][0]}-{files[-1][0]}"
 
 
+@contextlib.contextmanager
+def locked(plan: Plan) -> Iterator[Callable[[], None]]:
+    """Hold the output folder, made if need be; gives what `checkpoint.lock` gives.
+
+    Where the run fails before its first output, leave no trace of it: of the folders, those that it made. Where the folder was
+    removed meanwhile, whatever is there is another's; it is left alone, and said in place of other errors.
+    """
+    new_state = not is_there(plan.state)
+    made = _make(plan.out)
+    with checkpoint.lock(plan.state) as still:
+        try:
+            yield still
+        except BaseException as error:
+            try:
+                still()
+            except SvgfError as gone:
+                if isinstance(error, SvgfError):
+                    raise gone from error
+                raise error from error.__cause__
+            if new_state and not (is_there(plan.state / "run.json") and any(map(is_there, written(plan)))):
+                checkpoint.remove_state(plan.state)
+            with contextlib.suppress(OSError):  # not empty
+                if made is not None and os.path.samestat(made, plan.out.stat()):
+                    plan.out.rmdir()
+            raise
+
+
 def begin(plan: Plan, *, resume: bool, overwrite: bool) -> Checkpoint | None:
     """`find_start`, and the folder made ready: to be called with the output folder locked.
 
@@ -182,6 +210,15 @@ def stamp(path: str | None) -> list[str | int] | None:
 def stamp_frame(plan: Plan, index: int) -> list:
     """What tells that the inputs of one frame are still the same files: its number, and the stamp of each."""
     return [plan.files[index][0], *(stamp(files[index][1]) for files in (plan.files, *plan.others))]
+
+
+def _make(folder: Path) -> os.stat_result | None:
+    """Which folder this made; None where there was one, or none can be: to be told by who writes there."""
+    try:
+        folder.mkdir(parents=True)
+        return folder.stat()
+    except OSError:
+        return None
 
 
 def _start(plan: Plan, *, overwrite: bool) -> Checkpoint:

@@ -20,7 +20,7 @@ from svgf_jax.checkpoint import Checkpoint
 from svgf_jax.compiled import Filters, Pipeline, check_devices, compile_filters, to_host, wait
 from svgf_jax.methods import MethodConfig
 from svgf_jax.outputs import WriteOptions
-from svgf_jax.plan import Files, Plan, begin, check_there, is_there, make_plan, stamp, stamp_frame, written
+from svgf_jax.plan import Files, Plan, begin, check_there, locked, make_plan, stamp, stamp_frame
 from svgf_jax.threads import Submit, read_ahead, write_behind
 from svgf_jax.types import Config, Frame, History, Output, Params, SvgfError
 
@@ -155,6 +155,7 @@ def run(
         if report is not None:
             now = time.monotonic()
             report, complete_at = report._replace(seconds=now - complete_at), now
+            still_locked()
             checkpoint.append_figures(plan.state, report._asdict())
             statuses[report.status] += 1
             counts.update(report.counts)
@@ -168,8 +169,7 @@ def run(
         device_name.append(made.device)
         return made
 
-    new = not is_there(plan.out), not is_there(plan.state)
-    with checkpoint.lock(plan.state) as still_locked, _nothing_half_written(plan, *new):
+    with locked(plan) as still_locked:
         start = begin(plan, resume=resume, overwrite=overwrite)
         end = len(plan.files)
         if start is not None:
@@ -404,17 +404,3 @@ def _pictures(plan: Plan, options: WriteOptions) -> Iterator[np.ndarray]:
     for path in plan.outputs:
         if path is not None:
             yield preview.to_8bit(outputs.beauty(exr.read(path)), exposure=options.exposure, curve=options.tonemap)
-
-
-@contextlib.contextmanager
-def _nothing_half_written(plan: Plan, new_out: bool, new_state: bool) -> Iterator[None]:
-    """Where a run fails before its first output, leave no trace of it: of the folders, those that are new. Needs the lock."""
-    try:
-        yield
-    except BaseException:
-        if new_state and not (is_there(plan.state / "run.json") and any(map(is_there, written(plan)))):
-            checkpoint.remove_state(plan.state)
-        if new_out:
-            with contextlib.suppress(OSError):  # not empty
-                plan.out.rmdir()
-        raise
