@@ -16,6 +16,7 @@ from svgf_jax import exr
 from svgf_jax.cameras import Camera, Cameras, find_camera, load_cameras
 from svgf_jax.exr_layout import PathName
 from svgf_jax.matrices import load_matrices
+from svgf_jax.regular import require_regular
 from svgf_jax.sequences import Sequence, beside, companion
 from svgf_jax.types import SvgfError
 
@@ -103,6 +104,7 @@ def cameras_of_c_header(path: str, numbers: Iterable[int], size: tuple[int, int]
     Raises SvgfError: unreadable, no matrices, fewer than frames.
     """
     try:
+        require_regular(path)
         with open(path, encoding="utf-8", errors="replace") as file:
             text = re.sub(r"//.*|/\*[\s\S]*?\*/", "", file.read())
     except OSError as error:

@@ -14,12 +14,14 @@ Also understood: `world_to_screen` in place of `camera_to_screen`, and `object_t
 
 import json
 import os
+import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from svgf_jax.exr_layout import PathName
+from svgf_jax.regular import require_regular
 from svgf_jax.types import SvgfError
 
 BEHIND = -1e4
@@ -59,11 +61,12 @@ def load_cameras(path: PathName) -> Cameras:
     """Read a cameras.json. Raises SvgfError that names the file and the entry that is wrong."""
     name = os.fspath(path)
     try:
+        require_regular(name)
         with open(name, encoding="utf-8") as file:
             data = json.load(file)
     except OSError as error:
         raise SvgfError(f"{name}: cannot be read ({error.strerror or error}).") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SvgfError(f"{name}: not valid JSON ({error}).") from error
     entries = data.get("per_frame") if isinstance(data, dict) else None
     if not isinstance(entries, list) or not entries:
@@ -324,7 +327,7 @@ def _object_motion(cameras: Cameras, number: int, previous: int) -> dict[int, np
 
 def _by_id(entry: Mapping[str, Any], key: str, where: str) -> dict[int, np.ndarray]:
     objects = entry.get(key) or {}
-    if not isinstance(objects, Mapping) or not all(str(name).lstrip("-").isdigit() for name in objects):
+    if not isinstance(objects, Mapping) or not all(re.fullmatch("-?[0-9]{1,19}", str(name)) for name in objects):
         raise SvgfError(f'{where}: "{key}" wants matrices by object id, such as {{"7": [[1, 0, 0, 0], ...]}}.')
     return {int(name): _matrix(value, f'{where}: "{key}" of object {name}') for name, value in objects.items()}
 
@@ -332,7 +335,7 @@ def _by_id(entry: Mapping[str, Any], key: str, where: str) -> dict[int, np.ndarr
 def _matrix(value: Any, what: str) -> np.ndarray:
     try:
         matrix = np.array(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise SvgfError(f"{what} is {'missing' if value is None else 'wrong'}; wanted 4 x 4 finite numbers.")

@@ -23,6 +23,7 @@ import numpy as np
 from svgf_jax import atomic, limits, prints
 from svgf_jax.exr_chunks import check_chunks, check_size, check_tiles
 from svgf_jax.exr_layout import Layout, Part, PathName, Window, read_layout
+from svgf_jax.regular import require_regular
 from svgf_jax.types import SvgfError
 
 OLDEST_OPENEXR = (3, 5, 3)
@@ -186,6 +187,7 @@ def _opened(path: str, max_pixels: int | None) -> Iterator[tuple[BinaryIO, Layou
     try:
         if os.path.isdir(path):
             raise SvgfError(f"{path}: this is a folder; wanted one EXR file.")
+        require_regular(path)
         with open(path, "rb") as file:
             layout = read_layout(file, path, os.fstat(file.fileno()).st_size)
             most, chosen = limits.max_pixels() if max_pixels is None else (max_pixels, True)

@@ -11,6 +11,7 @@ import os
 import numpy as np
 
 from svgf_jax.cameras import Camera, Cameras
+from svgf_jax.regular import require_regular
 from svgf_jax.sequences import Sequence
 from svgf_jax.types import SvgfError
 
@@ -25,6 +26,7 @@ def load_matrices(sequence: Sequence) -> Cameras:
 
 def _read(path: str) -> Camera:
     try:
+        require_regular(path)
         size = os.path.getsize(path)
         with open(path, "rb") as file:
             head = file.read(4)

@@ -18,6 +18,7 @@ A parameter file is TOML:
 import difflib
 import math
 import os
+import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -208,8 +209,7 @@ def _number(name: str, value: Any, levels: int) -> Any:
         if (
             isinstance(entry, bool)
             or not isinstance(entry, int | float)
-            or not least <= entry <= most
-            or math.isinf(entry)
+            or not least <= entry <= min(most, sys.float_info.max)  # also of an integer that no float holds
         ):
             raise SvgfError(f"{name} = {entry!r}; wanted {bounds_of(least, most)}")
     return _per_level(entries) if per_level else float(value)

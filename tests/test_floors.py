@@ -7,7 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    {"atomic", "memory", "prints", "remedies"},
+    {"atomic", "memory", "prints", "regular", "remedies"},
     {"types"},
     {"limits", "tonemapping", "toml"},
     {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments", "motion", "processes"},
@@ -52,6 +52,7 @@ STAGES = {
 }
 NUMPY_ONLY = {
     "atomic",
+    "regular",
     "types",
     "toml",
     "parameters",

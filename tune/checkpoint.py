@@ -8,6 +8,7 @@ import numpy as np
 
 from svgf_jax import SvgfError
 from svgf_jax.atomic import replacing
+from svgf_jax.regular import require_regular
 from tune.fitting import Iteration, Progress
 from tune.solver import Descent, arrays, restored
 
@@ -80,6 +81,7 @@ def load(path: Path, fresh: Descent, identity: dict[str, Any]) -> Progress:
 
 def _content(path: Path) -> dict[str, np.ndarray]:
     """All arrays of the file. ValueError, whatever a damaged zip makes of itself (encrypted, a method nobody knows, ...)."""
+    require_regular(path)
     with path.open("rb") as file:
         try:
             with np.load(file, allow_pickle=False) as stored:
