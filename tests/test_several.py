@@ -91,6 +91,23 @@ def test_one_bad_task_keeps_nobody_from_the_others(tmp_path, capsys):
     assert several.deal(tasks, lambda task: 143) == 143
 
 
+def test_a_damaged_record_stops_its_own_task_only(tmp_path, capsys):
+    tasks, done = tasks_in(tmp_path, 3), []
+    tasks[1].state.mkdir(parents=True)
+    (tasks[1].state / "run.json").write_text("{")
+
+    def run(task):
+        checkpoint.load_run(task.state)  # as --resume does
+        return runner(done)(task)
+
+    assert several.deal(tasks, run) == 2
+    assert done == ["1-10", "21-30"]
+    told = capsys.readouterr().err
+    assert told.count("run.json: it is damaged") == 1
+    assert "11-20: failed, 0 of 10 frames" in told
+    assert "2 of 3 tasks complete" in told
+
+
 def test_who_holds_a_folder(tmp_path):
     state = checkpoint.state_folder(tmp_path, "1-5")
     assert not checkpoint.is_held(state)

@@ -122,9 +122,13 @@ def deal(tasks: Sequence[Task], run: Callable[[Task], int], *, rank: int = 0, si
 
 
 def _complete(task: Task) -> bool:
+    """A record that cannot be read says nothing: the run that needs it tells why, and fails alone."""
     from svgf_jax.checkpoint import load_run
 
-    record = load_run(task.state)
+    try:
+        record = load_run(task.state)
+    except SvgfError:
+        return False
     return record is not None and record[1]
 
 
