@@ -12,6 +12,7 @@ Several parts of one sequence may be written into one folder at a time: each has
 import contextlib
 import errno
 import json
+import math
 import os
 import socket
 import zipfile
@@ -164,7 +165,7 @@ def load_run(state: Path) -> tuple[Identity, bool] | None:
         return record["identity"], bool(record["complete"])
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except Exception as error:  # a damaged file may raise anything
         raise _unusable(path, error) from error
 
 
@@ -187,18 +188,20 @@ def load_checkpoint(state: Path, identity: Identity) -> Checkpoint | None:
     """
     path = state / "checkpoint.npz"
     try:
-        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-            entries = {name: file[name] for name in file.files}
-        if int(entries["format"]) != FORMAT:
-            raise ValueError(f"format {entries['format']}, wanted {FORMAT}")
-        next_index = int(entries["next_index"])
+        with open(path, "rb") as raw:
+            _check_sizes(raw)
+            with np.load(raw, allow_pickle=False) as file:
+                entries = {name: file[name] for name in file.files}
+        if (found := _whole(entries, "format")) != FORMAT:
+            raise ValueError(f"format {found}, wanted {FORMAT}")
+        next_index = _whole(entries, "next_index")
         saved = json.loads(entries["identity"].tobytes().decode())
         history = _unflat(entries)
-        if not 0 <= next_index <= len(saved["frames"]):
+        if not isinstance(saved["frames"], list) or not 0 <= next_index <= len(saved["frames"]):
             raise ValueError("incomplete")
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, zipfile.BadZipFile) as error:
+    except Exception as error:  # a damaged file may raise anything
         raise _unusable(path, error) from error
     check_same(state, saved, identity, used=next_index)
     return Checkpoint(next_index, history)
@@ -212,12 +215,64 @@ def _flat(history: History) -> dict[str, Any]:
 
 
 def _unflat(entries: dict[str, Any]) -> History | None:
-    """The inverse of `_flat`, None where there is no history; ValueError where arrays are missing."""
-    arrays = {name: entries[name] for name in History._fields if name in entries}
+    """The inverse of `_flat`, None where there is no history; ValueError where it is no history that a filter leaves."""
     taa = {name: entries[f"taa.{name}"] for name in TaaHistory._fields if f"taa.{name}" in entries}
+    arrays = {name: entries[name] for name in History._fields if name in entries and name != "taa"}
+    if len(entries) != len(arrays) + len(taa) + 3 or (taa and not arrays):
+        raise ValueError(f"it has {', '.join(sorted(entries))}")
     if len(arrays) not in (0, len(History._fields) - 1) or len(taa) not in (0, len(TaaHistory._fields)):
         raise ValueError("incomplete")
-    return History(**arrays, taa=TaaHistory(**taa) if taa else None) if arrays else None
+    if not arrays:
+        return None
+    history = History(**arrays, taa=TaaHistory(**taa) if taa else None)
+    _check_arrays(history)
+    return history
+
+
+def _check_arrays(history: History) -> None:
+    """ValueError unless all are of one frame, of one dtype, and finite."""
+    if history.illumination.ndim != 4 or 0 in history.illumination.shape:
+        raise ValueError(f"illumination is {history.illumination.shape}")
+    signals, height, width, _ = history.illumination.shape
+    shapes = {
+        "illumination": (signals, height, width, 3),
+        "moments": (signals, height, width, 2),
+        "normal": (height, width, 3),
+        "taa.color": (height, width, 3),
+        "taa.frames": (),
+    }
+    real = history.illumination.dtype
+    for name, array in _flat(history).items():
+        wanted, shape = np.dtype(np.int32) if name == "object_id" else real, shapes.get(name, (height, width))
+        if real not in (np.float32, np.float64) or array.dtype != wanted or array.shape != shape:
+            raise ValueError(f"{name} is {array.dtype} {array.shape}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} is not finite")
+    if (history.history_length < 0).any() or (history.taa is not None and history.taa.frames < 0):
+        raise ValueError("a history of fewer than 0 frames")
+
+
+def _whole(entries: dict[str, Any], name: str) -> int:
+    number = entries[name]
+    if number.shape != () or number.dtype.kind not in "iu":
+        raise ValueError(f"{name} is {number.dtype} {number.shape}")
+    return int(number)
+
+
+def _check_sizes(raw: BinaryIO) -> None:
+    """ValueError where entries would take more memory than the file has bytes: they are never compressed."""
+    with zipfile.ZipFile(raw) as archive:
+        entries = archive.infolist()
+        if sum(entry.file_size for entry in entries) > os.fstat(raw.fileno()).st_size:
+            raise ValueError("its entries are larger than the file")
+        for entry in entries:
+            with archive.open(entry) as file:
+                if np.lib.format.read_magic(file) != (1, 0):
+                    raise ValueError(f"{entry.filename} is of another version of .npy")
+                shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+                if math.prod(shape) * dtype.itemsize != entry.file_size - file.tell():
+                    raise ValueError(f"{entry.filename} is {dtype} {shape}, and of {entry.file_size} bytes")
+    raw.seek(0)
 
 
 def check_same(state: Path, saved: Identity, identity: Identity, *, used: int) -> None:

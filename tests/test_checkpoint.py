@@ -1,5 +1,7 @@
 import json
 import pickle
+import tracemalloc
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -108,9 +110,75 @@ def test_a_damaged_checkpoint_is_a_clear_error(out, how):
         checkpoint.load_checkpoint(state_folder(out), IDENTITY)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 9}', '{"format": 1, "identity": {}}'])
+def with_bad(array, value):
+    changed = np.array(array)
+    changed[(0,) * changed.ndim] = value
+    return changed
+
+
+NUMBERS = {  # what may be wrong in a file that is whole
+    "illumination: scalar": {"illumination": np.float32(1)},
+    "illumination: NaN": {"illumination": with_bad(HISTORY.illumination, np.nan)},
+    "illumination: of text": {"illumination": np.full((2, 4, 5, 3), "a")},
+    "illumination: of no signals": {"illumination": HISTORY.illumination[:0], "moments": HISTORY.moments[:0]},
+    "moments: inf": {"moments": with_bad(HISTORY.moments, np.inf)},
+    "moments: of one signal": {"moments": HISTORY.moments[:1]},
+    "history_length: negative": {"history_length": with_bad(HISTORY.history_length, -1)},
+    "depth: of another size": {"depth": HISTORY.depth[:3]},
+    "depth: of another dtype": {"depth": HISTORY.depth.astype(np.float64)},
+    "normal: NaN": {"normal": with_bad(HISTORY.normal, np.nan)},
+    "object_id: real": {"object_id": HISTORY.depth},
+    "taa: without its count": {"taa.color": TAA.color},
+    "taa: NaN": {"taa.color": TAA.color, "taa.frames": np.float32(np.nan)},
+    "taa: count of less than none": {"taa.color": TAA.color, "taa.frames": np.float32(-1)},
+    "another name": {"more": np.float32(1)},
+    "next_index: a list": {"next_index": np.array([1])},
+    "next_index: real": {"next_index": np.float64(1.5)},
+    "next_index: beyond": {"next_index": np.array(9)},
+    "identity: not one": {"identity": np.frombuffer(b"[]", np.uint8)},
+    "identity: deep": {"identity": np.frombuffer(b"[" * 100000, np.uint8)},
+}
+
+
+@pytest.mark.parametrize("what", NUMBERS)
+def test_numbers_that_no_run_leaves_are_refused(out, what):
+    identity = np.frombuffer(json.dumps(IDENTITY).encode(), np.uint8)
+    whole = HISTORY._asdict() | {"format": np.array(1), "next_index": np.array(1), "identity": identity}
+    del whole["taa"]
+    path = state_folder(out) / "checkpoint.npz"
+    np.savez(path, **whole)
+    assert checkpoint.load_checkpoint(state_folder(out), IDENTITY).next_index == 1
+    np.savez(path, **whole | NUMBERS[what])
+    with pytest.raises(SvgfError, match=r"Cannot resume from .*checkpoint\.npz.*damaged.*--overwrite"):
+        checkpoint.load_checkpoint(state_folder(out), IDENTITY)
+
+
+@pytest.mark.parametrize("how", ["encrypted", "unknown method", "bomb", "header"])
+def test_an_archive_that_promises_what_it_has_not_is_refused(out, how):
+    path = state_folder(out) / "checkpoint.npz"
+    identity = np.frombuffer(json.dumps(IDENTITY).encode(), np.uint8)
+    if how == "bomb":
+        np.savez_compressed(path, format=1, next_index=1, identity=identity, depth=np.zeros(10**6))
+    elif how == "header":  # of an array of 8 TB
+        with zipfile.ZipFile(path, "w") as archive, archive.open("depth.npy", "w") as file:
+            np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    else:
+        checkpoint.save_checkpoint(state_folder(out), IDENTITY, Checkpoint(1, HISTORY))
+        data = bytearray(path.read_bytes())
+        entry = data.index(b"PK\x01\x02")  # of the first array, in the directory
+        data[entry + 8 : entry + 12] = b"\x01\0\0\0" if how == "encrypted" else b"\0\0\x63\0"
+        path.write_bytes(data)
+    tracemalloc.start()
+    with pytest.raises(SvgfError, match=r"Cannot resume from .*checkpoint\.npz.*damaged.*--overwrite"):
+        checkpoint.load_checkpoint(state_folder(out), IDENTITY)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 10**6
+
+
+@pytest.mark.parametrize("text", ["deep", "", "{", "[]", '{"format": 9}', '{"format": 1, "identity": {}}'])
 def test_a_damaged_record_is_a_clear_error(out, text):
-    (out / ".svgf-jax" / "run.json").write_text(text)
+    (out / ".svgf-jax" / "run.json").write_text("[" * 100000 if text == "deep" else text)
     with pytest.raises(SvgfError, match=r"Cannot resume from .*run\.json"):
         checkpoint.load_run(state_folder(out))
 
