@@ -84,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Where whoever read the output has had enough (`| head`) it ends quietly: with 141 if there was more to come.
     """
     try:
+        terminal.require_lines(sys.argv[1:] if arguments is None else arguments)
         code = app.meta(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
         called = [name for name in (sys.argv[1:] if arguments is None else arguments)[:1] if name in app]

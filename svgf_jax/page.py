@@ -17,6 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
+from svgf_jax.spelling import visible
+
 WIDTH = 640  # pixels: pictures are never wider
 # Dark to bright in even steps of lightness, by eye; black to white in grey print too.
 _HEAT = (
@@ -74,8 +76,8 @@ class Legend(NamedTuple):
 
 
 def escape(text: object) -> str:
-    """Text for HTML, attributes included; bytes of file names that are no text are spelt out."""
-    return html.escape(str(text)).encode("utf-8", "backslashreplace").decode()
+    """Text for HTML, attributes included; control characters, and bytes of file names that are no text, are spelt out."""
+    return html.escape(visible(str(text)))
 
 
 def document(title: str, sections: Iterable[str]) -> str:
@@ -229,6 +231,7 @@ def picture(image: np.ndarray, *, most: int = 400_000, width: int = WIDTH) -> st
 
 def viewer(frames: Sequence[Shown], *, left: str, right: str, legends: Mapping[str, Legend]) -> str:
     """A scrubber over frames, a line between any two pictures of a frame, and the maps below; "" without frames."""
+    frames, left, right = [_spelt(frame) for frame in frames], visible(left), visible(right)
     names = list(dict.fromkeys(name for frame in frames for name in frame.pictures))
     if not names:
         return ""
@@ -268,6 +271,16 @@ frames anywhere.</p>
 <h2 id="maps-of"></h2><div class="maps" id="maps"></div>{lack}
 <script type="application/json" id="frames">{data}</script>
 """
+
+
+def _spelt(frame: Shown) -> Shown:
+    """The frame with its pictures' names as they are shown, by which the script finds them."""
+    return Shown(
+        frame.number,
+        {visible(name): url for name, url in frame.pictures.items()},
+        {visible(name): maps for name, maps in frame.maps.items()},
+        {visible(name): value for name, value in frame.psnr.items()},
+    )
 
 
 def evenly(numbers: Sequence[int], most: int) -> tuple[int, ...]:

@@ -7,7 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    {"atomic", "memory", "prints", "regular", "remedies"},
+    {"atomic", "memory", "prints", "regular", "remedies", "spelling"},
     {"types"},
     {"limits", "tonemapping", "toml"},
     {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments", "motion", "processes"},
@@ -53,6 +53,7 @@ STAGES = {
 NUMPY_ONLY = {
     "atomic",
     "regular",
+    "spelling",
     "types",
     "toml",
     "parameters",

@@ -13,6 +13,7 @@ from svgf_jax.cli import main
 from svgf_jax.commands import terminal
 from svgf_jax.parameters import load_params
 from svgf_jax.sequences import find_sequence
+from tune.__main__ import main as tune_main
 
 NASTY = {
     "<script>alert(1)</script>.R",
@@ -78,7 +79,8 @@ def test_what_steers_a_terminal_is_spelt_out(text, capsys):
     assert shown.isascii()
     assert "\\" in shown
     assert not controls(shown)
-    page.escape(text).encode()  # can be written
+    assert page.escape(text).isascii()
+    assert not controls(page.escape(text))
 
 
 def test_a_script_that_slipped_into_a_page_does_not_run(tmp_path):
@@ -99,6 +101,40 @@ def test_a_file_name_with_control_characters_is_refused(tmp_path):
     (tmp_path / "a\nwarning: all good.0001.exr").touch()
     with pytest.raises(SvgfError, match=r"control characters in the name 'a\\nwarning: all good.0001.exr'; rename it"):
         find_sequence(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "arguments", [["inspect", "{}"], ["inspect", "{}/none"], ["video", "a", "-o={}"], ["{}"]], ids=str
+)
+def test_a_folder_name_forges_no_line(arguments, tmp_path, capsys):
+    folder = tmp_path / "fk\nsvgf-jax: 100 frames complete"
+    write_shot(folder, (1,))
+    with pytest.raises(SystemExit) as left:
+        main([argument.format(folder) for argument in arguments])
+    assert left.value.code == 2
+    shown = capsys.readouterr()
+    assert not shown.out
+    assert len(shown.err.splitlines()) == 1
+    assert r"fk\nsvgf-jax: 100 frames complete" in shown.err
+    assert "rename the file or folder" in shown.err
+
+
+def test_pictures_with_names_that_turn_words_round_are_found_in_a_page():
+    name = "\u202egnp\x1b<b>"
+    shown = page.viewer([page.Shown(1, {name: "data:,"}, {}, {name: 30.0})], left=name, right=name, legends={})
+    assert not controls(shown)
+    stored = json.loads(shown.split('id="frames">')[1].split("</script>")[0])["frames"][0]
+    assert [*stored["pictures"]] == [*stored["notes"]] == [r"\u202egnp\x1b<b>"]
+    assert shown.count(r'<option value="\u202egnp\x1b&lt;b&gt;" selected>') == 2
+
+
+def test_the_tuner_says_nothing_raw_either(capsys):
+    for name in ("a\nsvgf-tune: all good", "none\x1b[31m"):
+        with pytest.raises(SystemExit):
+            tune_main([name, "-o", "x.toml", "--reference", "x"])
+        shown = capsys.readouterr().err
+        assert not controls(shown)
+        assert len(shown.splitlines()) == 1
 
 
 def test_values_of_toml_and_cameras_are_told_as_text(tmp_path, capsys):

@@ -8,6 +8,7 @@ from cyclopts import App, CycloptsError, Group, Parameter
 
 from svgf_jax import SvgfError, __version__
 from svgf_jax.cli import app as svgf_jax
+from svgf_jax.commands import terminal
 from svgf_jax.commands.project import located, use_project
 from tune.command import command
 
@@ -48,6 +49,7 @@ def launch(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run and exit: 0; 1 if a validation sequence got worse or the solver lost its way; 2 for an error; 130 interrupted."""
     try:
+        terminal.require_lines(sys.argv[1:] if arguments is None else arguments)
         code = app.meta(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
         fail(f"{str(error).strip()} See `svgf-tune --help`.")
@@ -61,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def fail(message: str) -> NoReturn:
     """Tell an error and exit with 2."""
-    print(f"svgf-tune: {message}", file=sys.stderr)
+    terminal.tell(f"svgf-tune: {message}")
     sys.exit(2)
 
 

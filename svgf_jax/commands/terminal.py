@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -11,6 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
+
+from svgf_jax.spelling import visible
+from svgf_jax.types import SvgfError
 
 if TYPE_CHECKING:
     from svgf_jax.streaming import FrameReport
@@ -33,21 +35,21 @@ REPAIRS = {
 """What became of the pixels that a frame's report counts, by its reason."""
 
 
-# But line ends and tabs; what turns the direction of writing or is invisible; bytes of file names that are no text.
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
-
-
-def visible(text: str) -> str:
-    """`text` with control characters spelt out: names from files shall not steer the terminal."""
-    return _CONTROL.sub(lambda found: ascii(found.group())[1:-1], text)
-
-
 def tell(text: str) -> None:
     """One message on the standard error. Where nobody can read it any more, the work goes on all the same."""
     try:
         print(visible(text), file=sys.stderr, flush=True)
     except OSError:  # `2>&1 | head`, a log on a full disk, a terminal that was closed
         silence(sys.stderr)
+
+
+def require_lines(arguments: Iterable[str]) -> None:
+    """SvgfError for an argument of several lines: a file's or folder's name that would pass for lines of a message."""
+    for argument in arguments:
+        if "\n" in argument:
+            raise SvgfError(
+                f"Got {argument!r}: a line break in an argument. If it is in a name, rename the file or folder."
+            )
 
 
 def _forgiving(stream: Any) -> Any:
