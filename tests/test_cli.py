@@ -87,7 +87,7 @@ ERRORS = {
     "unknown flag": (["denoise", "good", "-o", "out", "--pngs"], "--png"),
     "wrong choice": (["denoise", "good", "-o", "out", "--missing", "skip"], "hold"),
     "no such folder": (["denoise", "god", "-o", "out"], "good"),
-    "nothing inside": (["denoise", "nothing", "-o", "out"], "no EXR"),
+    "nothing inside": (["denoise", "nothing", "-o", "out"], "this one holds nothing"),
     "missing frame": (["denoise", "gap", "-o", "out"], "--missing hold|reset"),
     "bad range": (["denoise", "good", "-o", "out", "--frames", "one"], "1-100x2"),
     "cut off": (["denoise", "cut", "-o", "out"], "cut off"),
