@@ -14,10 +14,13 @@ _watching = 0
 
 
 class _Watched:
-    """A standard output that lets through what other threads print."""
+    """A standard output that lets through what other threads print.
 
-    def __init__(self, plain: Any):
-        self.plain = plain
+    One for good, which keeps the plain one too: `print` of another thread may still hold what was `sys.stdout` a moment ago, and
+    Python before 3.14 does not count that as a use.
+    """
+
+    plain: Any = None
 
     def write(self, text: str) -> int:
         kept = getattr(_here, "kept", None)
@@ -31,23 +34,26 @@ class _Watched:
         return getattr(self.plain, name)
 
 
+_watched: Any = _Watched()
+
+
 @contextmanager
 def kept() -> Iterator[list[str]]:
     """A list that receives what this thread would print inside; several threads may be inside at once."""
     global _watching
     with _lock:
-        if _watching == 0:
-            sys.stdout = _Watched(sys.stdout)
+        if _watching == 0 and sys.stdout is not _watched:
+            _watched.plain, sys.stdout = sys.stdout, _watched
         _watching += 1
-    _here.kept = []
+    before, _here.kept = getattr(_here, "kept", None), []
     try:
         yield _here.kept
     finally:
-        _here.kept = None
+        _here.kept = before
         with _lock:
             _watching -= 1
-            if _watching == 0 and isinstance(sys.stdout, _Watched):
-                sys.stdout = sys.stdout.plain
+            if _watching == 0 and sys.stdout is _watched:
+                sys.stdout = _watched.plain
 
 
 def set_results_apart() -> None:
