@@ -183,7 +183,7 @@ def test_half_float_ids_and_depth_are_warned_about(put):
     fine = native() | layer("id", 2048, "I") | layer("depth", 4, "Z")
     source = open_source(put(fine))
     assert source.warnings == (
-        "depth is in half float, in steps of 0.1 %: slopes become stairs. Let the renderer write 32-bit.",
+        "depth is in half float, in steps of 0.1 %: slopes become stairs. Let the renderer write this channel as 32-bit float.",
     )
     assert read_frame(source, 0).notes == ()
     (note,) = first(put(native() | layer("id", 4096, "I"))).notes

@@ -40,7 +40,7 @@ def test_falcor_has_a_file_for_each_output(mogwai):
     assert [number for number, _ in source.sequence.files] == [9, 10]
     assert source.sequence.name.endswith("Mogwai.PathTracer.color.#.exr")
     assert source.warnings == (
-        "depth is in half float, in steps of 0.1 %: slopes become stairs. Let the renderer write 32-bit.",
+        "depth is in half float, in steps of 0.1 %: slopes become stairs. Mogwai captures in half: copy the texture out in 32-bit.",
     )
     item = read_frame(source, 1)
     frame = item.frame
