@@ -1,4 +1,5 @@
 import os
+import stat
 
 import pytest
 
@@ -31,12 +32,17 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
     assert names(tmp_path) == ["a.txt"]
 
 
-def test_what_is_written_is_flushed_before_it_is_renamed(tmp_path, monkeypatch):
-    flushed = []
-    monkeypatch.setattr(os, "fsync", lambda _: flushed.append(names(tmp_path)))
-    atomic.write_text(tmp_path / "a.txt", "new")
-    assert len(flushed) == 1
-    assert "a.txt" not in flushed[0]
+def test_what_is_written_is_flushed_before_it_is_renamed_and_the_name_after(tmp_path, monkeypatch):
+    seen, fsync = [], os.fsync
+
+    def flush(descriptor):
+        kind = "folder" if stat.S_ISDIR(os.fstat(descriptor).st_mode) else "file"
+        seen.append((kind, (tmp_path / "a.txt").exists()))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", flush)
+    atomic.write_text(tmp_path / "a.txt", "x")
+    assert seen == [("file", False), ("folder", True)]
 
 
 def test_what_a_killed_process_left_is_written_over(tmp_path):
