@@ -34,7 +34,10 @@ class Viewer:
         self.thread.start()
 
     def serve(self):
-        connection, _ = self.socket.accept()
+        try:
+            connection, _ = self.socket.accept()
+        except OSError:  # closed before it came to this
+            return
         with connection, connection.makefile("rb") as stream:
             count = 0
             while (self.leave_after is None or count < self.leave_after) and len(size := stream.read(4)) == 4:
