@@ -12,10 +12,8 @@ Several parts of one sequence may be written into one folder at a time: each has
 import contextlib
 import errno
 import json
-import math
 import os
 import socket
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +22,7 @@ from typing import Any, BinaryIO, NamedTuple, TextIO
 import numpy as np
 
 from svgf_jax import atomic
+from svgf_jax.npz import read_arrays
 from svgf_jax.types import History, SvgfError, TaaHistory
 
 FOLDER = ".svgf-jax"
@@ -188,10 +187,7 @@ def load_checkpoint(state: Path, identity: Identity) -> Checkpoint | None:
     """
     path = state / "checkpoint.npz"
     try:
-        with open(path, "rb") as raw:
-            _check_sizes(raw)
-            with np.load(raw, allow_pickle=False) as file:
-                entries = {name: file[name] for name in file.files}
+        entries = read_arrays(path)
         if (found := _whole(entries, "format")) != FORMAT:
             raise ValueError(f"format {found}, wanted {FORMAT}")
         next_index = _whole(entries, "next_index")
@@ -257,22 +253,6 @@ def _whole(entries: dict[str, Any], name: str) -> int:
     if number.shape != () or number.dtype.kind not in "iu":
         raise ValueError(f"{name} is {number.dtype} {number.shape}")
     return int(number)
-
-
-def _check_sizes(raw: BinaryIO) -> None:
-    """ValueError where entries would take more memory than the file has bytes: they are never compressed."""
-    with zipfile.ZipFile(raw) as archive:
-        entries = archive.infolist()
-        if sum(entry.file_size for entry in entries) > os.fstat(raw.fileno()).st_size:
-            raise ValueError("its entries are larger than the file")
-        for entry in entries:
-            with archive.open(entry) as file:
-                if np.lib.format.read_magic(file) != (1, 0):
-                    raise ValueError(f"{entry.filename} is of another version of .npy")
-                shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-                if math.prod(shape) * dtype.itemsize != entry.file_size - file.tell():
-                    raise ValueError(f"{entry.filename} is {dtype} {shape}, and of {entry.file_size} bytes")
-    raw.seek(0)
 
 
 def check_same(state: Path, saved: Identity, identity: Identity, *, used: int) -> None:

@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"atomic", "memory", "prints", "regular", "remedies", "spelling"},
     {"types"},
-    {"limits", "tonemapping", "toml"},
+    {"limits", "tonemapping", "toml", "npz"},
     {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments", "motion", "processes"},
     {"windows", "noise", "exr_chunks"},
     {
@@ -53,6 +53,7 @@ STAGES = {
 NUMPY_ONLY = {
     "atomic",
     "regular",
+    "npz",
     "spelling",
     "types",
     "toml",

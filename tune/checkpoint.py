@@ -8,7 +8,7 @@ import numpy as np
 
 from svgf_jax import SvgfError
 from svgf_jax.atomic import replacing
-from svgf_jax.regular import require_regular
+from svgf_jax.npz import read_arrays
 from tune.fitting import Iteration, Progress
 from tune.solver import Descent, arrays, restored
 
@@ -52,7 +52,7 @@ def load(path: Path, fresh: Descent, identity: dict[str, Any]) -> Progress:
     Raises SvgfError: not there, damaged, of another version, or of another fit than `identity`.
     """
     try:
-        content = _content(path)
+        content = read_arrays(path)
         header = json.loads(str(content["header"]))
         if header["format"] != FORMAT:
             raise SvgfError(f"{path}: written by another version of svgf-tune; start anew without --resume")
@@ -77,17 +77,6 @@ def load(path: Path, fresh: Descent, identity: dict[str, Any]) -> Progress:
         raise SvgfError(f"{path}: no checkpoint to resume from; start without --resume") from None
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, MemoryError) as error:
         raise SvgfError(f"{path}: damaged ({error}); delete it and start without --resume") from None
-
-
-def _content(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of the file. ValueError, whatever a damaged zip makes of itself (encrypted, a method nobody knows, ...)."""
-    require_regular(path)
-    with path.open("rb") as file:
-        try:
-            with np.load(file, allow_pickle=False) as stored:
-                return {name: stored[name] for name in stored.files}
-        except Exception as error:
-            raise ValueError(str(error) or type(error).__name__) from None
 
 
 def _check(content: dict[str, np.ndarray], header: dict[str, Any], fresh: Descent) -> None:
