@@ -41,12 +41,6 @@ def to_config(config) -> Config:
     return Config(**config)
 
 
-# For tests of how something is computed rather than of what: all else compiles quickly (conftest.py).
-AS_USERS: tuple = (("xla_backend_optimization_level", 3), ("xla_llvm_disable_expensive_passes", False))
-if jax.__version_info__[:2] == (0, 10):
-    AS_USERS += (("xla_cpu_use_fusion_emitters", True),)
-
-
 @functools.cache
 def jitted(function, config: Config, options=()):
     return jax.jit(functools.partial(function, config=config), compiler_options=dict(options))

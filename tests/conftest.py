@@ -1,22 +1,17 @@
 """Strict by default: dtype and rank promotion are errors, float64 is on (tests choose their dtypes themselves)."""
 
-import os
 import runpy
 from pathlib import Path
 
 import jax
 import pytest
+from compiling import compile_quickly
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Tests, and the commands that they start, compile quickly rather than well: a third of the time (`bridge.AS_USERS` does not).
-QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-if jax.__version_info__[:2] == (0, 10):  # later ones do not know it
-    QUICK += " --xla_cpu_use_fusion_emitters=false"
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
-
+compile_quickly()  # `compiling.AS_USERS` takes it back
 runpy.run_path(str(Path(__file__).parent / "offline" / "sitecustomize.py"))  # nor do tests ask the network
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

@@ -3,6 +3,7 @@
 import functools
 
 import bridge
+import compiling
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -271,12 +272,12 @@ def test_step_by_step_and_scan_agree_to_the_bit_and_bad_pixels_stay_out():
     frames = bridge.to_frames(scenes.synthetic(3, 29, 34, frames=3, signals=1, dirty=True), np.float32)
     lean = {"levels": 0, "variance": "temporal", "fallback": False, "reprojection": "nearest"}  # quick to compile
     config, params = Config(light_cell=4, **lean), Params()
-    _, scanned = bridge.jitted_denoise(config, bridge.AS_USERS)(frames, params=params)
+    _, scanned = bridge.jitted_denoise(config, compiling.AS_USERS)(frames, params=params)
     history = None
     for t in range(3):
         frame = jax.tree.map(lambda leaf, t=t: leaf[t], frames)
         history = sj.init(frame) if history is None else history
-        history, output = bridge.jitted_step(config, bridge.AS_USERS)(history, frame, params=params)
+        history, output = bridge.jitted_step(config, compiling.AS_USERS)(history, frame, params=params)
         jax.tree.map(lambda a, b, t=t: np.testing.assert_array_equal(a, b[t]), output, scanned)
         assert all(np.isfinite(a).all() for a in (output.illumination, output.change, history.moments))
     assert np.abs(output.change).max() > 0.1

@@ -9,7 +9,8 @@ import oracle
 import pytest
 import scenes
 import test_stages_oracle
-from bridge import AS_USERS, jitted_denoise, jitted_step, to_config, to_frames, to_params
+from bridge import jitted_denoise, jitted_step, to_config, to_frames, to_params
+from compiling import AS_USERS
 
 from svgf_jax import SvgfError, antialiasing
 from svgf_jax.pipeline import init, step

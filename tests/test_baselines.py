@@ -9,7 +9,8 @@ import numpy as np
 import oracle_games202 as oracle
 import pytest
 import scenes
-from bridge import AS_USERS, to_frame
+from bridge import to_frame
+from compiling import AS_USERS
 
 from svgf_jax import SvgfError, exr, streaming
 from svgf_jax.baselines import baseline_denoise, baseline_init, baseline_step, filter_alone, one_signal

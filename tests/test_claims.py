@@ -6,7 +6,8 @@ import numpy as np
 import oracle
 import pytest
 import scenes
-from bridge import AS_USERS, jitted_denoise, jitted_step, run, to_config, to_frame, to_frames, to_history, to_params
+from bridge import jitted_denoise, jitted_step, run, to_config, to_frame, to_frames, to_history, to_params
+from compiling import AS_USERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracle_classic as oracle
 import pytest
-from bridge import AS_USERS
+from compiling import AS_USERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -6,7 +6,8 @@ import numpy as np
 import oracle
 import pytest
 import scenes
-from bridge import AS_USERS, PRESETS, relative_error, run, worst
+from bridge import PRESETS, relative_error, run, worst
+from compiling import AS_USERS
 
 REAL_FRAMES = 4  # enough for history lengths on both sides of 4
 PER_LEVEL = oracle.PAPER | {

@@ -2,6 +2,7 @@
 
     python tests/bench/spoil_pixels.py                       # 12 000 sequences of five frames, a quarter for each preset
     python tests/bench/spoil_pixels.py --cases 50000 --seed 9
+    python tests/bench/spoil_pixels.py --what derivatives variance --presets adaptive      # "variance": frames that bring it
     python tests/bench/spoil_pixels.py --recovery            # after four bad frames: how many until the picture is right again
 
 hypothesis draws from tests/bad_pixels.py (16 x 12 pixels, two signals, float32): up to six faults, each of one channel, some
@@ -23,6 +24,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import scenes  # noqa: E402
 from bridge import jitted_step, to_frame  # noqa: E402
+from compiling import compile_quickly  # noqa: E402
 from hypothesis import HealthCheck, Phase, given, settings  # noqa: E402
 from hypothesis import seed as seeded  # noqa: E402
 
@@ -32,10 +34,8 @@ from svgf_jax.types import Frame, Params  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+compile_quickly()
 
-
-# Compiles in a third of the time.
-QUICK = (("xla_backend_optimization_level", 0), ("xla_llvm_disable_expensive_passes", True))
 KINDS = {
     "NaN in a pixel": ("radiance", (0, 5, 5), np.nan),
     "firefly of 100": ("radiance", (0, 5, 5), 100.0),
@@ -74,7 +74,7 @@ def hold(property_of, count: int, seed: int) -> None:
 def forward(preset: str, count: int, seed: int, *, variance: bool) -> str:
     """The filter over so many sequences: how many, and the largest share of the bound."""
     params, config = ready(preset)
-    run = jax.jit(partial(denoise, config=config), compiler_options=dict(QUICK))
+    run = jax.jit(partial(denoise, config=config))
     shares = []
 
     def check(case):
@@ -95,7 +95,7 @@ def backward(preset: str, count: int, seed: int) -> str:
         _, output = denoise(frames._replace(radiance=radiance), params=params, config=config)
         return jnp.mean(output.image / (1.0 + jnp.abs(output.image)))
 
-    gradient = jax.jit(jax.grad(loss, argnums=(0, 1)), compiler_options=dict(QUICK))
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1)))
     done = []
 
     def check(case):
@@ -113,7 +113,7 @@ def backward(preset: str, count: int, seed: int) -> str:
 def recovery(preset: str, kind: str) -> int | None:
     """Frames after four bad ones until a wall of light 1 is within 5 % everywhere; None = not in 150."""
     params, config = ready(preset)
-    step = jitted_step(config, QUICK)
+    step = jitted_step(config)
     wall = to_frame(scenes.flat(*bad_pixels.SIZE, signals=2), np.float32)
     good = {name: values for name, values in wall._asdict().items() if values is not None}
     channel, where, value = KINDS[kind]
@@ -137,6 +137,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=12_000)
     parser.add_argument("--gradients", type=int, default=1_200)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--what", nargs="*", default=["plain", "variance", "derivatives"])
     parser.add_argument("--presets", nargs="*", default=["paper", "falcor", "tuned", "adaptive"])
     parser.add_argument("--recovery", action="store_true")
     options = parser.parse_args()
@@ -146,16 +147,15 @@ def main() -> None:
         return
     count, gradients = (total // len(options.presets) for total in (options.cases, options.gradients))
     jobs = {
-        "": partial(forward, count=count // 2, variance=False),
-        "with measured variance": partial(forward, count=count // 2, variance=True),
+        "plain": partial(forward, count=count // 2, variance=False),
+        "variance": partial(forward, count=count // 2, variance=True),
         "derivatives": partial(backward, count=gradients),
     }
-    for what, job in jobs.items():
+    for what in options.what:
         for i, preset in enumerate(options.presets):
             began = time.monotonic()
-            print(
-                f"{preset} {what}: {job(preset, seed=options.seed + i)}, {time.monotonic() - began:.0f} s", flush=True
-            )
+            told = jobs[what](preset, seed=options.seed + i)
+            print(f"{preset} {what}: {told}, {time.monotonic() - began:.0f} s", flush=True)
 
 
 if __name__ == "__main__":
