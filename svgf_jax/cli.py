@@ -8,9 +8,9 @@ import sys
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, NoReturn
 
-from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts import App, CycloptsError, Parameter
 
-from svgf_jax import __version__, limits
+from svgf_jax import __version__
 from svgf_jax.commands import terminal
 from svgf_jax.commands.ablate import ablate
 from svgf_jax.commands.compare import compare
@@ -19,6 +19,7 @@ from svgf_jax.commands.denoise import denoise
 from svgf_jax.commands.inspect import inspect
 from svgf_jax.commands.params import diff, list_, show
 from svgf_jax.commands.project import located, use_project
+from svgf_jax.commands.settings import PROJECT, Largest
 from svgf_jax.commands.video import video
 from svgf_jax.types import SvgfError
 
@@ -59,23 +60,20 @@ def completion(shell: Literal["bash", "zsh", "fish", "powershell"], /, *, instal
 @app.meta.default
 def launch(
     *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
-    config: Annotated[str, Parameter(metavar="FILE", group=Group("Project", sort_key=9))] = "auto",
-    max_pixels: Annotated[int | None, Parameter(metavar="COUNT", group=Group("Project", sort_key=9))] = None,
+    config: Annotated[str, Parameter(metavar="FILE", group=PROJECT)] = "auto",
+    largest: Largest = Largest(),
 ) -> Any:
     """Run a command with the project's file behind it.
 
     Args:
         config: Flags of this project, a table for each command or for all; auto takes the nearest svgf-jax.toml, none ignores it.
-        max_pixels: Read pictures of up to so many pixels (268435456 if not given), however small their files.
     """
     use_project(app, config, commands=app)
-    limits.set_max_pixels(max_pixels)
     try:
-        with located(app):
+        with located(app), largest.held():
             return app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
     finally:
         app.config = ()
-        limits.set_max_pixels(None)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -10,6 +10,7 @@ Reading and writing may be called from several threads at once.
 
 import os
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -20,9 +21,10 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from svgf_jax import atomic, limits, prints
+from svgf_jax import atomic, prints
 from svgf_jax.exr_chunks import check_chunks, check_size, check_tiles
 from svgf_jax.exr_layout import Layout, Part, PathName, Window, read_layout
+from svgf_jax.limits import Limits, limits
 from svgf_jax.regular import require_regular
 from svgf_jax.types import SvgfError
 
@@ -77,10 +79,10 @@ def new_image(
     return Image(channels, window, window, dict(attributes or {}))
 
 
-def read_header(path: PathName, *, max_pixels: int | None = None) -> Header:
+def read_header(path: PathName, *, most: Limits | None = None) -> Header:
     """Names, types, windows and attributes of a file, in about a millisecond. Raises SvgfError as `read` does."""
     path = fspath(path)
-    with _opened(path, max_pixels) as (file, layout):
+    with _opened(path, most) as (file, layout):
         opened = _open(path, file, header_only=True)
     parts = layout.parts
     types = {full: parts[i].channels[name].dtype for (i, name), full in _merged_names(parts).items()}
@@ -89,15 +91,15 @@ def read_header(path: PathName, *, max_pixels: int | None = None) -> Header:
     return Header(types, first.data_window, first.display_window, _attributes(opened), names, first.compression)
 
 
-def read(path: PathName, *, max_pixels: int | None = None) -> Image:
+def read(path: PathName, *, most: Limits | None = None) -> Image:
     """All channels of a file, tiled or scanline, one part or several; of mip and rip maps the picture itself.
 
-    Raises SvgfError: missing, empty, not an EXR, cut off or corrupt, deep, subsampled, parts of different size, more than
-    `max_pixels` pixels, or, where those are not given (here or to `limits`), more than its bytes are likely to hold. All of
-    this is checked before anything is allocated.
+    Raises SvgfError: missing, empty, not an EXR, cut off or corrupt, deep, subsampled, parts of different size, more
+    pixels than `most` allows, or more than so small a file holds (None: what `svgf_jax.limits` has). All of this is checked
+    before anything is allocated.
     """
     path = fspath(path)
-    with _opened(path, max_pixels) as (file, layout):
+    with _opened(path, most) as (file, layout):
         check_chunks(file, path, layout)
         with prints.kept() as printed:
             opened = _open(path, file, header_only=False)
@@ -138,7 +140,8 @@ def write(path: PathName, image: Image, *, compression: str = "zip") -> tuple[st
     try:
         with atomic.replacing(path) as temporary:
             bindings.File(header, channels).write(str(temporary))
-            with _opened(str(temporary), image.channels[next(iter(channels))].size):  # a full disk need not have raised
+            own = Limits(image.channels[next(iter(channels))].size, sys.maxsize)
+            with _opened(str(temporary), own):  # a full disk need not have raised
                 pass
     except (OSError, RuntimeError, ValueError, TypeError, SvgfError) as error:
         reason = _write_failure(path, error)
@@ -182,7 +185,7 @@ def _text(version: tuple[int, ...]) -> str:
 
 
 @contextmanager
-def _opened(path: str, max_pixels: int | None) -> Iterator[tuple[BinaryIO, Layout]]:
+def _opened(path: str, most: Limits | None) -> Iterator[tuple[BinaryIO, Layout]]:
     """A file that may be read, by its header, and its layout. Raises SvgfError."""
     try:
         if os.path.isdir(path):
@@ -190,11 +193,10 @@ def _opened(path: str, max_pixels: int | None) -> Iterator[tuple[BinaryIO, Layou
         require_regular(path)
         with open(path, "rb") as file:
             layout = read_layout(file, path, os.fstat(file.fileno()).st_size)
-            most, chosen = limits.max_pixels() if max_pixels is None else (max_pixels, True)
-            _check_parts(path, layout.parts, most)
+            most = limits() if most is None else most
+            _check_parts(path, layout.parts, most.pixels)
             check_tiles(path, layout)
-            if not chosen:
-                check_size(path, layout)
+            check_size(path, layout, most.ratio)
             yield file, layout
     except OSError as error:
         raise SvgfError(f"{path}: cannot be read ({error.strerror or error}).") from error

@@ -10,22 +10,17 @@ from typing import BinaryIO
 import numpy as np
 
 from svgf_jax.exr_layout import Layout, Part, count_levels, head_size
+from svgf_jax.limits import PLAUSIBLE
 from svgf_jax.types import SvgfError
 
-PLAUSIBLE = 1100
-"""Deflate packs at most 1032 bytes into one. Of what is packed closer, at most `LARGEST` bytes are believed: DWA, HTJ2K and
-ZSTD pack a black picture up to 120 000 times, and what they decode takes up to six times its size in memory."""
 
-LARGEST = 2**28
-
-
-def check_size(path: str, layout: Layout) -> None:
-    """Raise SvgfError where a file claims more pixels than its bytes can hold, before they are allocated."""
+def check_size(path: str, layout: Layout, ratio: int) -> None:
+    """Raise SvgfError where a file claims more pixels than its bytes are likely to hold, before they are allocated."""
     claimed = sum(part.size[0] * part.size[1] * _pixel_bytes(part) for part in layout.parts)
-    if claimed > LARGEST and claimed > PLAUSIBLE * layout.bytes:
+    if claimed > PLAUSIBLE and claimed > ratio * layout.bytes:
         raise SvgfError(
             f"{path}: {claimed / 1e9:.2g} GB of pixels in a file of {layout.bytes} bytes. Render or copy this frame again; if "
-            f"it is all of one colour, say so by --max-pixels {layout.parts[0].size[0] * layout.parts[0].size[1]}."
+            f"it is known to be all of one colour, raise max_ratio (--max-ratio {-(-claimed // layout.bytes)})."
         )
 
 
@@ -33,7 +28,7 @@ def check_tiles(path: str, layout: Layout) -> None:
     """Raise SvgfError for tiles far larger than their picture: the library keeps room for whole ones."""
     for part in layout.parts:
         if part.tiles is not None:
-            largest = max(LARGEST, part.size[0] * part.size[1] * _pixel_bytes(part))
+            largest = max(PLAUSIBLE, part.size[0] * part.size[1] * _pixel_bytes(part))
             if part.tiles.width * part.tiles.height * _pixel_bytes(part) > largest:
                 raise SvgfError(
                     f"{path}: tiles of {part.tiles.width} x {part.tiles.height} in a picture of {part.size[0]} x "

@@ -20,6 +20,7 @@ from svgf_jax.assembly import IN_FRAME, Place, assemble, check_roles, meaning_of
 from svgf_jax.camera_files import find_cameras
 from svgf_jax.cameras import Cameras
 from svgf_jax.exr_layout import PathName, Window
+from svgf_jax.limits import Limits, limits
 from svgf_jax.motion import parse_convention
 from svgf_jax.roles import Roles, canonical_role, check_channels, left_out, resolve_roles
 from svgf_jax.sequences import Missing, Sequence, beside, companion, find_sequence, patterns
@@ -39,7 +40,7 @@ class Source(NamedTuple):
         cameras: from cameras.json, if there is one.
         data_window, display_window: of the first frame; every frame must have the same.
         warnings: what the user should know before the work starts, as sentences.
-        max_pixels: largest picture that will be read, if not that of `svgf_jax.limits`.
+        most: how large a picture may be that is read.
         position: whether frames get their `Frame.position`.
         table: the renderer's table (`svgf_jax.renderers`).
     """
@@ -52,7 +53,7 @@ class Source(NamedTuple):
     data_window: Window
     display_window: Window
     warnings: tuple[str, ...]
-    max_pixels: int | None
+    most: Limits
     position: bool = False
     table: renderers.Table = renderers.NATIVE
 
@@ -93,6 +94,7 @@ def open_source(
     meaning: Mapping[str, str] | None = None,
     position: bool = False,
     max_pixels: int | None = None,
+    max_ratio: int | None = None,
 ) -> Source:
     """Find the files of a sequence and settle the roles by the first frame's header; no pixel is read.
 
@@ -113,6 +115,7 @@ def open_source(
         position: also give each frame its world positions, which the joint bilateral filter reads: the renderer's, or from
             depth and cameras.
         max_pixels: refuse larger pictures; those of more than 2**28 pixels if None.
+        max_ratio: refuse files that claim more than 256 MB of pixels and so many times their own bytes; 1100 if None.
 
     Raises SvgfError: whatever is missing or unclear, naming the file.
     """
@@ -123,7 +126,8 @@ def open_source(
     means |= {} if motion is None else {"motion": str(parse_convention(motion))}
     sequence = _find_frames(pattern, table, frames=frames, missing=missing, warmup=warmup)
     at, path = next((i, path) for i, (_, path) in enumerate(sequence.files) if path is not None)
-    read_header = partial(exr.read_header, max_pixels=max_pixels)
+    most = limits(max_pixels, max_ratio)
+    read_header = partial(exr.read_header, most=most)
     header = read_header(path)
     there = patterns(os.path.dirname(path))
     table = table or renderers.detect_renderer(header.channels, header.attributes, tuple(there))
@@ -173,7 +177,7 @@ def open_source(
         header.data_window,
         header.display_window,
         told,
-        max_pixels,
+        most,
         position,
         table,
     )
@@ -297,7 +301,7 @@ def _find_frames(pattern: PathName, table: renderers.Table | None, **options: An
 
 
 def _read(path: str, source: Source) -> exr.Image:
-    image = exr.read(path, max_pixels=source.max_pixels)
+    image = exr.read(path, most=source.most)
     check_windows(image, path, source)
     return image
 

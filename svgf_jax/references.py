@@ -6,6 +6,7 @@ import numpy as np
 
 from svgf_jax import exr
 from svgf_jax.exr_layout import PathName
+from svgf_jax.limits import limits
 from svgf_jax.planes import light
 from svgf_jax.renderers import detect_renderer, in_layer
 from svgf_jax.roles import resolve_roles
@@ -16,12 +17,12 @@ NAMES = ("ref", "reference", "frame")
 """What the sequence of references in a folder may be called, the most likely first."""
 
 
-def read_radiance(path: PathName, *, max_pixels: int | None = None) -> np.ndarray:
+def read_radiance(path: PathName, *, max_pixels: int | None = None, max_ratio: int | None = None) -> np.ndarray:
     """Total radiance `[H, W, 3]` float32: R, G, B where the file has them, else the renderer's beauty, else all light added up.
 
-    Raises SvgfError: unreadable, or nothing of this is there.
+    `max_pixels` and `max_ratio` as in `open_source`. Raises SvgfError: unreadable, or nothing of this is there.
     """
-    image = exr.read(path, max_pixels=max_pixels)
+    image = exr.read(path, most=limits(max_pixels, max_ratio))
     where = os.fspath(path)
     if {"R", "G", "B"} <= image.channels.keys():
         roles = resolve_roles(tuple(image.channels), channel={"radiance": "RGB"}, where=where)

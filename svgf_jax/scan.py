@@ -103,7 +103,7 @@ def _check_file(source: Source, index: int) -> dict[str, Header]:
     for role, layer in source.roles.layers.items():
         where = str(source.files[role].files[index][1]) if layer.own_file else str(path)
         if where not in headers:
-            headers[where] = read_header(where, max_pixels=source.max_pixels)
+            headers[where] = read_header(where, most=source.most)
             check_windows(headers[where], where, source)
         check_channels(layer, headers[where].channels, where=where, role=role)
     return headers

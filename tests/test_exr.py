@@ -10,6 +10,7 @@ import OpenEXR
 import pytest
 
 from svgf_jax import SvgfError, exr
+from svgf_jax.limits import Limits
 
 
 def ramp(height=10, width=12, dtype=np.float32):
@@ -207,9 +208,9 @@ def test_a_size_that_no_memory_holds_is_refused_before_it_is_allocated(good):
 
 
 def test_max_pixels(good):
-    assert exr.read(good, max_pixels=64 * 48).channels
+    assert exr.read(good, most=Limits(64 * 48)).channels
     with pytest.raises(SvgfError, match="48 x 64 pixels; wanted at most 3071"):
-        exr.read(good, max_pixels=64 * 48 - 1)
+        exr.read(good, most=Limits(64 * 48 - 1))
 
 
 def test_strings_and_paths_are_both_file_names(good):

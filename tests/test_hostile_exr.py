@@ -11,7 +11,9 @@ import exr_files
 import numpy as np
 import pytest
 
+import tune.__main__ as tuner
 from svgf_jax import SvgfError, cli, exr, limits, prints
+from svgf_jax.limits import Limits
 
 WINDOW = (-3, 4, 17, 20)
 SHAPE = (17, 21)
@@ -159,27 +161,29 @@ def claim(put, width, height, size, compression=9, tile=None) -> Path:
 
 
 def test_a_small_file_that_claims_a_large_picture_is_refused_before_it_is_allocated(put):
-    refused(claim(put, 30_000, 8_000, 2048), "0.96 GB of pixels in a file of 2048 bytes.*--max-pixels 240000000")
+    refused(claim(put, 30_000, 8_000, 2048), "0.96 GB of pixels in a file of 2048 bytes.*--max-ratio 468750")
     refused(claim(put, 30_000, 30_000, 2048), "30000 x 30000 pixels; wanted at most 268435456.*--max-pixels")
     refused(claim(put, 1 << 14, 1 << 14, 500_000), "1.1 GB of pixels in a file of 500000 bytes")
     refused(claim(put, 1 << 12, 1 << 12, 2048), "corrupt")  # 64 MB are believed; the library then finds nothing in it
 
 
-def test_who_says_how_large_pictures_are_is_believed(put):
+def test_who_says_how_large_pictures_are_is_believed_but_their_files_are_not(put):
     path = claim(put, 1 << 14, 1 << 13, 2048)
-    assert exr.read_header(path, max_pixels=2**27).data_window == (0, 0, (1 << 14) - 1, (1 << 13) - 1)
-    with pytest.raises(SvgfError, match="GB of pixels"):
-        exr.read_header(path)
-    limits.set_max_pixels(2**27)
+    for most in None, Limits(2**27), Limits(2**40), Limits(2**27, 2**18 - 1):
+        with pytest.raises(SvgfError, match=r"0\.54 GB of pixels .* \(--max-ratio 262144\)"):
+            exr.read_header(path, most=most)
+    assert exr.read_header(path, most=Limits(2**27, 2**18)).data_window == (0, 0, (1 << 14) - 1, (1 << 13) - 1)
+    limits.set_limits(2**27, 2**18)
     try:
         assert exr.read_header(path).channels
-        limits.set_max_pixels(2**27 - 1)
+        limits.set_limits(2**27 - 1, 2**18)
         with pytest.raises(SvgfError, match="wanted at most 134217727"):
             exr.read_header(path)
     finally:
-        limits.set_max_pixels(None)
-    with pytest.raises(SvgfError, match="Got --max-pixels 0"):
-        limits.set_max_pixels(0)
+        limits.set_limits()
+    for wrong, said in ({"pixels": 0}, "--max-pixels 0"), ({"ratio": -1}, "--max-ratio -1"):
+        with pytest.raises(SvgfError, match=f"Got {said}; wanted"):
+            limits.set_limits(**wrong)
 
 
 @pytest.mark.parametrize("bad", ["R\x1b[31m", "a\nb", "\x9b31m", "a\x7f"])
@@ -252,13 +256,19 @@ def test_a_crash_of_a_library_is_told():
     assert "Segmentation fault" in ran.stderr
 
 
-def test_max_pixels_on_the_command_line(put, capsys):
-    path = put(exr_files.write([part()]))
-    for command in ["inspect", str(path)], ["compare", str(path), str(path)]:
+def test_limits_on_the_command_line(put, capsys):
+    path = str(put(exr_files.write([part()])))
+    tune = ["--reference", path, "-o", f"{path}.toml"]
+    for program, command in (cli, ["inspect", path]), (cli, ["compare", path, path]), (tuner, [path, *tune]):
         with pytest.raises(SystemExit):
-            cli.main([*command, "--max-pixels", "356"])
+            program.main([*command, "--max-pixels", "356"])
         assert "21 x 17 pixels; wanted at most 356" in capsys.readouterr().err
     assert exr.read(path).channels
+    claim(put, 1 << 14, 1 << 13, 2048)
+    with pytest.raises(SystemExit):
+        cli.main(["inspect", path, "--max-pixels", "1000000000"])
+    assert "--max-ratio 262144" in capsys.readouterr().err
+    assert limits.limits() == Limits()
 
 
 def test_a_short_campaign_finds_nothing(tmp_path):

@@ -4,12 +4,13 @@ import sys
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, NoReturn
 
-from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts import App, CycloptsError, Parameter
 
 from svgf_jax import SvgfError, __version__
 from svgf_jax.cli import app as svgf_jax
 from svgf_jax.commands import terminal
 from svgf_jax.commands.project import located, use_project
+from svgf_jax.commands.settings import PROJECT, Largest
 from tune.command import command
 
 app: App = App(
@@ -20,13 +21,13 @@ app: App = App(
     help_format="plaintext",
 )
 app.default(command)
-PROJECT = Group("Project", sort_key=9)
 
 
 @app.meta.default
 def launch(
     *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
     config: Annotated[str, Parameter(metavar="FILE", group=PROJECT)] = "auto",
+    largest: Largest = Largest(),
     completion: Annotated[Literal["bash", "zsh", "fish", "powershell"] | None, Parameter(group=PROJECT)] = None,
 ) -> Any:
     """Run with the project's file behind the command line.
@@ -40,7 +41,7 @@ def launch(
         return 0
     use_project(app, config, commands=svgf_jax, table="tune")
     try:
-        with located(app):
+        with located(app), largest.held():
             return app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
     finally:
         app.config = ()

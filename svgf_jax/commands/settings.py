@@ -1,12 +1,14 @@
 """Options that set numbers and names: `--preset`, `--params`, `--set NAME=VALUE`, `--channel ROLE=...`. No JAX."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 
+from svgf_jax import limits
 from svgf_jax.commands.completing import LAYER, RENDERER
 from svgf_jax.methods import METHOD_CHOICES, MethodConfig, check_settable, override_method
 from svgf_jax.types import CHOICES, Config, Params, SvgfError, choices_of
@@ -56,9 +58,32 @@ Method = Literal[
     "bilateral",
     "gaussian",
 ]
-INPUT = Group("Input", sort_key=0)
+INPUT, PROJECT = Group("Input", sort_key=0), Group("Project", sort_key=9)
 Flag: Parameter = Parameter(negative=(), show_default=False)
 Repeated: Parameter = Parameter(negative=(), consume_multiple=False, show_default=False)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Largest:
+    """How large the pictures may be that a command reads: one group for every command of both programs.
+
+    Attributes:
+        max_pixels: Read pictures of up to so many pixels.
+        max_ratio: Above 256 MB of pixels, believe a file that claims up to so many times its own bytes.
+    """
+
+    max_pixels: Annotated[int, Parameter(metavar="COUNT", group=PROJECT)] = limits.MAX_PIXELS
+    max_ratio: Annotated[int, Parameter(metavar="TIMES", group=PROJECT)] = limits.MAX_RATIO
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Let them hold meanwhile."""
+        limits.set_limits(self.max_pixels, self.max_ratio)
+        try:
+            yield
+        finally:
+            limits.set_limits()
 
 
 @Parameter(name="*")
