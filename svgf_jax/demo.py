@@ -2,6 +2,7 @@
 
 import importlib.resources
 import importlib.util
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -60,7 +61,7 @@ def run(
     picture = Path(out) / "demo.png"
     video = Path(out) / "demo.mp4" if importlib.util.find_spec("av") is not None else None
     for path in (picture, video):
-        if path is not None and path.exists() and not overwrite:
+        if path is not None and os.path.exists(path) and not overwrite:
             raise SvgfError(f"{path} exists already, from an earlier demo? Choose another folder, or --overwrite.")
     source = open_source(sample())
     summary = streaming.run(

@@ -1,13 +1,15 @@
 """What a run will write, checked before it starts: output names, collisions, and where a resumed run begins. No JAX."""
 
 import contextlib
+import errno
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from svgf_jax import checkpoint
+from svgf_jax.atomic import check_names, short
 from svgf_jax.checkpoint import Checkpoint, Identity
 from svgf_jax.types import SvgfError
 
@@ -59,9 +61,9 @@ def make_plan(
     `warmup`: so many of the first files get no output, and the run is a part of a larger one; None: it is the whole.
     `identity` is all of what the run computes but its input frames, which are added here.
 
-    Raises SvgfError: `out` is a file or names one, an output would be an input, nothing there to hold.
+    Raises SvgfError: `out` is a file or names one, an output would be an input or has too long a name, nothing there to hold.
     """
-    if out.suffix.lower() == ".exr" or re.search(r"[#%*?@]", out.name) or out.is_file():
+    if out.suffix.lower() == ".exr" or re.search(r"[#%*?@]", out.name) or os.path.isfile(out):
         raise SvgfError(
             f"Got {out} as the output; wanted a folder, for example {out.parent / 'denoised'}. "
             "The files in it get the names of the inputs."
@@ -80,6 +82,7 @@ def make_plan(
     stem = _stem(next((path.name for path in planned if path), ""))
     film = out / f"{stem}{f'.{part}' if part else ''}.mp4" if video else None
     state = checkpoint.state_folder(out, part)
+    _check_names([*planned, film])
     plan = Plan(out, files, planned, png, film, dict(identity), hold, before, state, tuple(others))
     plan.identity["frames"] = [stamp_frame(plan, index) for index in range(len(files))]
     return plan
@@ -212,6 +215,20 @@ def stamp_frame(plan: Plan, index: int) -> list:
     return [plan.files[index][0], *(stamp(files[index][1]) for files in (plan.files, *plan.others))]
 
 
+def _check_names(paths: Iterable[Path | None]) -> None:
+    """SvgfError where an output has a longer name than the file system takes, its folder's included."""
+    for path in filter(None, paths):
+        try:
+            check_names(path)
+        except OSError as error:
+            if error.errno == errno.ENAMETOOLONG:
+                name, whole = (len(os.fsencode(text)) for text in (path.name, path.absolute()))
+                raise SvgfError(
+                    f"{path}: this output's name has {name} bytes, {whole} with its folders; the file system takes no longer "
+                    "ones (255, and 4096 with the folders, on most). Choose another output folder, or shorten the inputs' names."
+                ) from error
+
+
 def _make(folder: Path) -> os.stat_result | None:
     """Which folder this made; None where there was one, or none can be: to be told by who writes there."""
     try:
@@ -257,7 +274,7 @@ def _resume(plan: Plan) -> Checkpoint | None:
 
 def _remove_temporary(plan: Plan) -> None:
     """Remove what a killed run was writing: `.NAME.*.tmp` for the names of this plan, and nothing else."""
-    names = {path.name for path in written(plan)}
+    names = {short(path.name) for path in written(plan)}
     for path in plan.out.glob(".*.tmp"):
         if path.name[1:].rsplit(".", 2)[0] in names:
             path.unlink(missing_ok=True)

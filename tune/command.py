@@ -1,6 +1,7 @@
 """`svgf-tune`: options in, a parameter file out. Nothing here imports JAX or NumPy at the top: help and errors answer at once."""
 
 import dataclasses
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -10,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Group, Parameter
 
 from svgf_jax import SvgfError
-from svgf_jax.commands import settings, terminal
+from svgf_jax.atomic import short
+from svgf_jax.commands import results, settings, terminal
 from svgf_jax.commands.completing import PRESET
 from svgf_jax.commands.settings import INPUT, Flag, Reading
 from svgf_jax.processes import Process, check_meeting, leave, meet
@@ -109,21 +111,21 @@ def command(
         overwrite: Replace outputs that exist.
     """
     name, start, config = settings.choose(preset, params, set_)
-    checkpoint = out.with_name(f".{out.name}.progress.npz")
+    checkpoint = out.with_name(f".{short(out.name)}.progress.npz")
     _check(noisy, reference, second, validate, validate_reference, robust)
     _check_numbers(robust_width, temporal, prior, max_steps, starts, tangent_batch)
     _check_apart(noisy, frames, validate, validate_frames, second)
     if report is not None and report.resolve() == out.resolve():
         raise SvgfError(f"Got {out} for both --out and --report; wanted two files.")
-    for path in (out, report, None if maps is None else maps / MAPS):
-        if path is not None and path.exists() and not (overwrite or resume):
-            raise SvgfError(f"{path} exists already; choose another name, or --overwrite.")
-        if path in (out, report) and path is not None and not path.absolute().parent.is_dir():
+    for path in filter(None, (out, report)):
+        if not os.path.isdir(path.absolute().parent):
             raise SvgfError(f"{path}: there is no folder {path.absolute().parent}; make it, or choose another name.")
-    if resume and not checkpoint.exists():
-        raise SvgfError(f"{checkpoint}: no checkpoint to resume from; start without --resume.")
-    if maps is not None and maps.exists() and not maps.is_dir():
+    if maps is not None and os.path.exists(maps) and not os.path.isdir(maps):
         raise SvgfError(f"--maps {maps} is a file; wanted a folder.")
+    results.require_writable((out, report, None if maps is None else maps / MAPS), overwrite=overwrite or resume)
+    results.require_writable((checkpoint,), overwrite=True)
+    if resume and not os.path.exists(checkpoint):
+        raise SvgfError(f"{checkpoint}: no checkpoint to resume from; start without --resume.")
     check_meeting(distributed, coordinator, processes, process)
     opened = reading.options()
     if flip:

@@ -1,5 +1,6 @@
 """Files of results that commands write: complete or not at all, and asked for before the work."""
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,11 +16,12 @@ def require_writable(paths: Iterable[Path | None], *, overwrite: bool) -> None:
     for path in paths:
         if path is None:
             continue
-        if path.exists() and not overwrite:
+        if os.path.exists(path) and not overwrite:
             raise SvgfError(f"{path} exists already; choose another name, or --overwrite.")
-        folder = next(above for above in path.absolute().parents if above.exists())
+        folder = next(above for above in path.absolute().parents if os.path.exists(above))
         try:
-            atomic.require_writable(path if path.parent.exists() else folder / path.name)
+            atomic.check_names(path)
+            atomic.require_writable(path if os.path.exists(path.parent) else folder / path.name)
         except OSError as error:
             raise _not_written(path, error) from error
 
@@ -34,4 +36,5 @@ def save(path: Path, text: str) -> None:
 
 
 def _not_written(path: Path, error: OSError) -> SvgfError:
-    return SvgfError(f"Could not write {path}: {error.strerror or error}. Choose a folder that is writable.")
+    why = error.strerror or error
+    return SvgfError(f"Could not write {path}: {why}. Choose a folder that is writable and a name that it takes.")

@@ -5,6 +5,7 @@ lock of its own: a process takes one that is neither complete nor held, its own 
 another process goes on where its last checkpoint is.
 """
 
+import os
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -64,7 +65,7 @@ def plan_tasks(
 def shot_names(shots: Sequence[str]) -> list[str]:
     """What each shot's output folder is called: as the folder it lies in, or as its files where that tells them not apart."""
     by_folder = [
-        Path(shot).resolve().name if Path(shot).is_dir() else Path(shot).resolve().parent.name for shot in shots
+        Path(shot).resolve().name if os.path.isdir(shot) else Path(shot).resolve().parent.name for shot in shots
     ]
     by_files = [re.sub(r"[._-]*(#+|@+|%\d*d|\$F\d*|\d+)$", "", Path(shot).stem) for shot in shots]
     for names in (by_folder, by_files):

@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from svgf_jax.commands import settings, terminal
-from svgf_jax.types import SvgfError
+from svgf_jax.commands import results, settings, terminal
 
 
 def video(
@@ -39,8 +38,7 @@ def video(
         scale: Screen pixels a pixel, each way.
         overwrite: Replace the file if it exists.
     """
-    if out.exists() and not overwrite:
-        raise SvgfError(f"{out} exists already; choose another name, or --overwrite.")
+    results.require_writable((out,), overwrite=overwrite)
     from svgf_jax.film import make_film
 
     count, rate = make_film(
