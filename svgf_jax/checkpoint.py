@@ -12,6 +12,7 @@ Several parts of one sequence may be written into one folder at a time: each has
 import contextlib
 import errno
 import json
+import math
 import os
 import socket
 from collections.abc import Callable, Iterator, Mapping
@@ -23,10 +24,12 @@ import numpy as np
 
 from svgf_jax import atomic
 from svgf_jax.npz import read_arrays
+from svgf_jax.regular import require_regular
 from svgf_jax.types import History, SvgfError, TaaHistory
 
 FOLDER = ".svgf-jax"
 FORMAT = 1  # of the files in FOLDER
+_MOST_TEXT = 2**28  # bytes; a million frames have less
 
 Identity = dict[
     str, Any
@@ -62,9 +65,10 @@ def lock(state: Path) -> Iterator[Callable[[], None]]:
 
 
 def is_held(state: Path) -> bool:
-    """Whether a run holds a state folder now."""
+    """Whether a run holds a state folder now. Makes no file."""
     try:
-        file = open(state / "lock", "a+")  # noqa: SIM115 (closed below)
+        require_regular(state / "lock")
+        file = open(state / "lock")  # noqa: SIM115 (closed below)
     except OSError:
         return False
     with file:
@@ -74,8 +78,8 @@ def is_held(state: Path) -> bool:
 def holder(state: Path) -> str:
     """`process 12 on node3`: who holds a state folder, or held it last; "" if nobody ever did."""
     try:
-        return (state / "lock").read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError):
+        return _text(state / "lock").strip()
+    except (OSError, ValueError):
         return ""
 
 
@@ -110,6 +114,8 @@ def _locked(path: Path, *, shared: bool) -> TextIO:
             raise SvgfError(f"{kept} is a symbolic link; nothing is written through it. Remove it.")
     for _ in range(10):
         path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists():
+            require_regular(path)
         file = open(path, "a+")  # noqa: SIM115 (open for as long as the lock is held)
         if not _try_lock(file, shared=shared):
             with file:
@@ -158,7 +164,7 @@ def load_run(state: Path) -> tuple[Identity, bool] | None:
     """(identity, complete) of the run recorded in `state`; None if there is no record."""
     path = state / "run.json"
     try:
-        record = json.loads(path.read_text())
+        record = json.loads(_text(path))
         if record["format"] != FORMAT or not isinstance(record["identity"]["frames"], list):
             raise ValueError(f"format {record['format']}, wanted {FORMAT}")
         return record["identity"], bool(record["complete"])
@@ -271,6 +277,8 @@ def append_figures(state: Path, figures: Mapping[str, Any]) -> None:
     """Note what is known of one frame that is done; its "number" says which. Raises SvgfError."""
     path = state / "frames.jsonl"
     try:
+        if path.exists():
+            require_regular(path)
         with path.open("ab+") as file:
             file.seek(max(file.tell() - 1, 0))
             cut_off = file.read() not in (b"", b"\n")  # by a full disk, or with its process
@@ -282,12 +290,40 @@ def append_figures(state: Path, figures: Mapping[str, Any]) -> None:
 def load_figures(state: Path) -> dict[int, dict[str, Any]]:
     """What is known of the frames by number, the latest of each; a line that is cut off or damaged counts for nothing."""
     found: dict[int, dict[str, Any]] = {}
-    with contextlib.suppress(OSError, UnicodeDecodeError):
-        for line in (state / "frames.jsonl").read_text(encoding="utf-8").splitlines():
-            with contextlib.suppress(ValueError, KeyError, TypeError):
+    with contextlib.suppress(OSError, ValueError):
+        for line in _text(state / "frames.jsonl").splitlines():
+            with contextlib.suppress(ValueError, KeyError, RecursionError):
                 figures = json.loads(line)
-                found[int(figures["number"])] = figures
+                if _are_figures(figures):
+                    found[figures["number"]] = figures
     return found
+
+
+def _are_figures(line: Any) -> bool:
+    """Whether a line is one that a run writes, as far as anybody relies on it."""
+    kinds = {
+        "number": int,
+        "status": str,
+        "path": str | None,
+        "counts": dict,
+        "seconds": float,
+        "history": float | None,
+    }
+    if not isinstance(line, dict) or not all(
+        isinstance(line[name], kinds[name]) for name in kinds.keys() & line.keys()
+    ):
+        return False
+    counts = line.get("counts", {}).values()
+    numbers = [line[name] for name in ("seconds", "history") if line.get(name) is not None]
+    return all(type(count) is int and abs(count) < 2**63 for count in counts) and all(map(math.isfinite, numbers))
+
+
+def _text(path: Path) -> str:
+    """A text file of a state folder, whatever lies there by now. Raises OSError, ValueError."""
+    require_regular(path)
+    if (size := path.stat().st_size) > _MOST_TEXT:
+        raise ValueError(f"{size} bytes")
+    return path.read_text(encoding="utf-8")
 
 
 def remove_figures(state: Path) -> None:

@@ -175,6 +175,7 @@ def run(
         if start is not None:
             read = partial(_read, source, plan)
             write = partial(_write, source, plan, options, provenance, on_output, still_locked)
+            fill_gap = partial(_fill_gap, plan, still_locked)
             save = partial(_save, plan, still_locked)
             workers = threads if threads == 1 else 2 * threads  # one writes a frame before it reads the next
             with (
@@ -186,7 +187,17 @@ def run(
             ):
                 keep = on_output is not None
                 end = _filter(
-                    plan, start, loaded, filters, write, save, submit, stop, checkpoint_every, keep_frames=keep
+                    plan,
+                    start,
+                    loaded,
+                    filters,
+                    write,
+                    fill_gap,
+                    save,
+                    submit,
+                    stop,
+                    checkpoint_every,
+                    keep_frames=keep,
                 )
         if start is not None and end == len(plan.files):
             still_locked()
@@ -248,6 +259,7 @@ def _filter(
     loaded: Iterator[frames.LoadedFrame | None],
     make_filters: Callable[[], Filters],
     write: Callable[[int, frames.LoadedFrame, Output], FrameReport],
+    fill_gap: Callable[[int], FrameReport],
     save_state: Callable[[Checkpoint], None],
     submit: Submit,
     stop: Callable[[], bool],
@@ -275,7 +287,7 @@ def _filter(
         if item is None:
             if not plan.hold:
                 history = None
-            submit(partial(_fill_gap, plan, index), after_all=True)
+            submit(partial(fill_gap, index), after_all=True)
         else:
             filters = filters or make_filters()
             history, output = filters.step(filters.init(item.frame) if history is None else history, item.frame)
@@ -385,7 +397,7 @@ def _write(
     return FrameReport(plan.files[index][0], "filtered", path, dict(counts), tuple(notes), history)
 
 
-def _fill_gap(plan: Plan, index: int) -> FrameReport:
+def _fill_gap(plan: Plan, still_locked: Callable[[], None], index: int) -> FrameReport:
     """Stand in for a missing frame: the output before it again, or nothing. Runs once that output is complete."""
     number, path = plan.files[index][0], plan.outputs[index]
     if index < plan.warmup:
@@ -394,6 +406,7 @@ def _fill_gap(plan: Plan, index: int) -> FrameReport:
         return FrameReport(number, "skipped", None, {}, ())
     before = plan.outputs[index - 1]
     assert before is not None  # the first frame of a plan that holds is there
+    still_locked()
     for suffix in (".exr", ".png") if plan.png else (".exr",):
         preview.copy_file(before.with_suffix(suffix), path.with_suffix(suffix))
     return FrameReport(number, "held", path, {}, ())

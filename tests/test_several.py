@@ -110,8 +110,10 @@ def test_a_damaged_record_stops_its_own_task_only(tmp_path, capsys):
 
 def test_who_holds_a_folder(tmp_path):
     state = checkpoint.state_folder(tmp_path, "1-5")
+    state.mkdir(parents=True)
     assert not checkpoint.is_held(state)
     assert checkpoint.holder(state) == ""
+    assert list(state.iterdir()) == []  # to ask leaves nothing behind
     with lock(state):
         assert checkpoint.is_held(state)
         with pytest.raises(Busy):

@@ -1,0 +1,63 @@
+"""What may lie in a state folder by now: nobody waits for it, believes it, or writes through it."""
+
+import os
+
+import pytest
+
+from svgf_jax import SvgfError, checkpoint, streaming
+from svgf_jax.plan import locked, make_plan
+
+
+def test_a_missing_frame_is_not_held_in_a_folder_that_is_anothers_by_now(tmp_path):
+    (tmp_path / "a_1.exr").touch()
+    files = [(1, str(tmp_path / "a_1.exr")), (2, None)]
+    plan = make_plan(files, tmp_path / "out", hold=True, png=False, video=False, identity={})
+    with locked(plan) as still:
+        plan.outputs[0].touch()
+        assert streaming._fill_gap(plan, still, 1).status == "held"
+        plan.outputs[1].unlink()
+        (plan.state / "lock").unlink()
+        with pytest.raises(SvgfError, match="the output folder was removed"):
+            streaming._fill_gap(plan, still, 1)
+    assert not plan.outputs[1].exists()
+
+
+@pytest.mark.parametrize("put", ["pipe", "device"])
+def test_nobody_waits_for_a_pipe_or_reads_a_device(tmp_path, put):
+    for name in ("lock", "run.json", "frames.jsonl", "checkpoint.npz"):
+        if put == "pipe":
+            os.mkfifo(tmp_path / name)
+        else:
+            (tmp_path / name).symlink_to("/dev/zero")
+    assert not checkpoint.is_held(tmp_path)
+    assert checkpoint.holder(tmp_path) == ""
+    assert checkpoint.load_figures(tmp_path) == {}
+    said = f"it is a {'named pipe' if put == 'pipe' else 'device'}"
+    for read in (checkpoint.load_run, lambda state: checkpoint.load_checkpoint(state, {})):
+        with pytest.raises(SvgfError, match=rf"{tmp_path}/.*{said}.*--overwrite"):
+            read(tmp_path)
+    with pytest.raises(SvgfError, match=f"{tmp_path}/frames.jsonl: {said}"):
+        checkpoint.append_figures(tmp_path, {"number": 1})
+    with pytest.raises(SvgfError, match=said if put == "pipe" else "is a symbolic link"):
+        checkpoint.lock(tmp_path).__enter__()
+
+
+def test_lines_that_no_run_wrote_count_for_nothing(tmp_path):
+    sound = '{"number": 7, "status": "held", "path": null, "counts": {"normal": 3}, "notes": [], "seconds": 0.5}'
+    wrong = [
+        "[" * 100_000,
+        "7",
+        '{"status": "held"}',
+        '{"number": Infinity}',
+        '{"number": "7"}',
+        '{"number": 7, "seconds": NaN}',
+        '{"number": 7, "seconds": "1"}',
+        '{"number": 7, "history": -Infinity}',
+        '{"number": 7, "counts": [1]}',
+        '{"number": 7, "counts": {"normal": "3"}}',
+        f'{{"number": 7, "counts": {{"normal": 1{"0" * 4000}}}}}',
+        '{"number": 7, "status": ["<script>"]}',
+    ]
+    (tmp_path / "frames.jsonl").write_text("\n".join([sound, *wrong]))
+    assert checkpoint.load_figures(tmp_path)[7]["counts"] == {"normal": 3}
+    assert list(checkpoint.load_figures(tmp_path)) == [7]
