@@ -30,6 +30,8 @@ from svgf_jax.types import SvgfError
 
 OLDEST_OPENEXR = (3, 5, 3)
 """The first that mends every flaw known when this was written: https://github.com/AcademySoftwareFoundation/openexr/releases."""
+MOST_CHANNELS = 10_000
+"""Of a file: the library's own time grows with their square, to a second for so many."""
 COMPRESSIONS = ("none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab")
 
 _STRUCTURAL = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name", "preview"}
@@ -223,6 +225,8 @@ def _check_parts(path: str, parts: Sequence[Part], max_pixels: int) -> None:
         raise SvgfError(
             f"{path}: its parts have different data windows {sorted(windows)}; wanted one. Write a file per part."
         )
+    if (count := sum(len(part.channels) for part in parts)) > MOST_CHANNELS:
+        raise SvgfError(f"{path}: {count} channels; wanted at most {MOST_CHANNELS}. Write them into several files.")
     width, height = parts[0].size
     if width * height > max_pixels:
         raise SvgfError(

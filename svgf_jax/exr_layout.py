@@ -33,6 +33,7 @@ _FLAGS = _VERSION | _SINGLE_TILE | _LONG_NAMES | _DEEP | _MULTI_PART
 _PIXEL_TYPES = {0: np.dtype(np.uint32), 1: np.dtype(np.float16), 2: np.dtype(np.float32)}
 _ATTRIBUTES = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "name", "tiles", "type"}
 _MOST_ATTRIBUTES = 2**16  # of a file: each takes time before anything else can be judged
+_LONGEST_NAME = 255  # bytes
 _FARTHEST = 2**30  # of a corner: farther out the library's own arithmetic ends
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
@@ -175,8 +176,8 @@ def _read_parts(file: BinaryIO, size: int) -> tuple[list[Part], list[int], bool]
 def _read_attributes(file: BinaryIO, size: int, budget: int) -> tuple[dict[str, bytes], int]:
     """One header's attributes by name, raw; those of no interest here (they can be megabytes) are skipped."""
     attributes = {}
-    while name := _string(file, size):
-        _string(file, size)
+    while name := _string(file):
+        _string(file)
         length = struct.unpack("<i", _exactly(file, 4, size))[0]
         budget -= 1
         if not 0 <= length <= size - file.tell() or name in attributes or budget < 0:
@@ -256,14 +257,14 @@ def _count_chunks(part: Part, attributes: dict[str, bytes]) -> int:
     return count
 
 
-def _string(file: BinaryIO, size: int) -> str:
+def _string(file: BinaryIO) -> str:
     """A zero-terminated name."""
-    raw = bytearray()
-    while (byte := _exactly(file, 1, size)) != b"\0":
-        raw += byte
-        if len(raw) > 255:
-            raise ValueError("a name longer than 255 bytes")
-    return _text(bytes(raw))
+    raw = file.read(_LONGEST_NAME + 1)
+    end = raw.find(b"\0")
+    if end < 0:
+        raise ValueError("a name longer than 255 bytes") if len(raw) > _LONGEST_NAME else EOFError("the file ends here")
+    file.seek(end + 1 - len(raw), 1)
+    return _text(raw[:end])
 
 
 def _text(raw: bytes) -> str:

@@ -21,8 +21,9 @@ Meanings: of `motion` a convention (`svgf_jax.motion`); of `depth` "z" (this lib
 stands for no object.
 """
 
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from fnmatch import fnmatchcase
+from fnmatch import fnmatchcase, translate
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -217,7 +218,8 @@ def detect_renderer(channels: Collection[str], attributes: Iterable[str] = (), f
 
     It is the table of which most lines are there; `NATIVE` if none says more than the native names do.
     """
-    there = {"channels": tuple(channels), "attributes": tuple(attributes), "files": tuple(files)}
+    names = {"channels": channels, "attributes": attributes, "files": files}
+    there = {kind: tuple(map(str.lower, ones)) for kind, ones in names.items()}
     tables = [load_table(name) for name in renderer_names()]
     found = [
         sum(_is_there(line, there[kind], table) for kind, lines in table.detect.items() for line in lines)
@@ -227,7 +229,9 @@ def detect_renderer(channels: Collection[str], attributes: Iterable[str] = (), f
 
 
 def _is_there(line: str, names: Iterable[str], table: Table) -> bool:
-    return any(_like(name, line) or (table.layered and _like(name, f"*.{line}")) for name in names)
+    """Whether one of the names, in lower case, is like a line of the table."""
+    lines = (line, f"*.{line}") if table.layered else (line,)
+    return any(map(re.compile("|".join(map(translate, map(str.lower, lines)))).match, names))
 
 
 def layers_of(table: Table, channels: Iterable[str]) -> tuple[str, ...]:

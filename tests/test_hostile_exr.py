@@ -186,6 +186,16 @@ def test_who_says_how_large_pictures_are_is_believed_but_their_files_are_not(put
             limits.set_limits(**wrong)
 
 
+def test_channels_beyond_number_are_refused(put):
+    for count in (10_000, 10_001):
+        pixels = {f"{i:05d}": np.zeros((1, 1), "<f2") for i in range(count)}
+        path = put(exr_files.write([part(pixels=pixels, window=(0, 0, 0, 0))]), f"{count}.exr")
+        if count > 10_000:
+            refused(path, "10001 channels; wanted at most 10000")
+        else:
+            assert len(exr.read_header(path).channels) == count
+
+
 @pytest.mark.parametrize("bad", ["R\x1b[31m", "a\nb", "\x9b31m", "a\x7f"])
 def test_names_that_could_steer_a_terminal_are_refused(put, bad):
     channel = exr_files.write([part(pixels={bad: np.zeros(SHAPE, "<f4")})])
