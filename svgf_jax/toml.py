@@ -2,6 +2,8 @@
 
 import re
 import tomllib
+from bisect import bisect_left
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +14,12 @@ LARGEST = 1_000_000
 """Bytes; a bigger file is something else."""
 LONGEST, DEEPEST = 10_000, 100
 """Characters of a line, and tables in tables: tomllib's time grows with their square."""
+
+_TOKENS = re.compile(
+    r'"""(?:[^\\]|\\.)*?"{3,5}(?!")' r"|'''.*?'{3,5}(?!')" r'|"(?:[^"\\\n]|\\.)*"' r"|'[^'\n]*'|#[^\n]*|[\[\]{}]|\n",
+    re.DOTALL,
+)
+"""What a line's end may lie in, and what may hide that: texts, comments, brackets."""
 
 
 class TomlFile(NamedTuple):
@@ -76,20 +84,27 @@ def place(file: TomlFile, *keys: str | int) -> str:
 
 
 def line_of(text: str, *keys: str | int) -> int:
-    """The line, from 1, where TOML `text` begins to give a key.
+    """The line, from 1, where TOML `text` begins to give a key; the last one where it does not. `text` parses as a whole.
 
-    The first lines are parsed, always more of them, until the key is there: no second parser, and right wherever tomllib is.
+    The first statements are parsed, more or fewer of them, until those are found with which the key is there: no second
+    parser, and right wherever tomllib is.
     """
-    lines, parsed = text.split("\n"), 0
-    for end in range(1, len(lines) + 1):
-        try:
-            content = tomllib.loads("\n".join(lines[:end]))
-        except tomllib.TOMLDecodeError:  # within a value of several lines
-            continue
-        if _has(content, keys):
-            return parsed + 1
-        parsed = end
-    return len(lines)
+    lines = text.split("\n")
+    starts = [*_statements(text), len(lines)]
+    first = bisect_left(starts, True, lo=1, key=lambda end: _has(tomllib.loads("\n".join([*lines[:end], ""])), keys))
+    return starts[first - 1] + 1 if first < len(starts) else len(lines)
+
+
+def _statements(text: str) -> Iterator[int]:
+    """The lines, from 0, that begin a statement, a comment or nothing: those within brackets and texts of several lines don't."""
+    line, depth = 0, 0
+    yield 0
+    for found in _TOKENS.finditer(text):
+        token = found[0]
+        line += token.count("\n")
+        depth += (token in "[{") - (token in "]}")
+        if token == "\n" and depth == 0:
+            yield line
 
 
 def _has(content: Any, keys: tuple[str | int, ...]) -> bool:
