@@ -1,6 +1,7 @@
 """What must not mislead a fit: targets of something else, and checkpoints of another fit. NumPy only."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -30,7 +31,7 @@ def test_references_are_like_their_frames_whatever_the_noise(shot):
     assert found.correlation > 0.99
     assert found.slope == pytest.approx(1, abs=0.02)
     assert found.ratio == pytest.approx(1, abs=0.01)
-    assert found[3:] == ((0, 0), 0, 0)
+    assert found[3:] == ((0, 0), 0, 0, "")
     assert doubts("shot", found) == ()
 
 
@@ -65,17 +66,39 @@ def test_a_second_noisy_render_is_as_good_as_a_reference(shot):
     assert "in x and -3 in y" in told
 
 
-def test_of_pictures_without_contrast_nothing_is_said():
-    """A wall and its noise: block means hold nothing by which two pictures could be alike."""
+def test_of_a_wall_and_its_noise_nothing_can_be_told():
+    """Block means hold nothing by which two pictures could be alike."""
     rng = np.random.default_rng(1)
     like = shot_of_files(str(sample()), str(sample()), frames="0").read(0).frame
     frame = like._replace(radiance=rng.gamma(0.5, 2.0, like.radiance.shape), emission=0 * like.emission)
-    found = likeness(Shot("wall", 1, lambda i: Example(frame, 2 + 0 * frame.emission)))
+    found = likeness(Shot("wall", 1, lambda i: Example(frame, 2 + rng.normal(0, 0.01, frame.emission.shape))))
     assert np.isnan(found.correlation)
     assert found.displacement == (0, 0)
-    assert doubts("wall", found) == ()
+    (told,) = doubts("wall", found)
+    assert told == "wall: whether the targets belong to the frames cannot be told: the frames are mostly noise"
     nothing = likeness(Shot("none", 1, lambda i: Example(frame, None)))
     assert doubts("none", nothing) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda t: 0 * t, "all pixels of the targets are 0"),
+        (lambda t: 0 * t + 0.5, "all pixels of the targets are 0.5"),
+        (lambda t: 0.5 + 1e-3 * t, "the targets have no contrast"),
+        (
+            lambda t: np.where(np.arange(len(t))[:, None, None] < 80, 0, t),
+            r"light is in \d\d blocks of 16 x 16 pixels of both",
+        ),
+    ],
+    ids=["black", "grey", "pale", "mostly black"],
+)
+def test_where_targets_say_nothing_that_is_told(shot, change, said):
+    found = likeness(changed(shot, lambda t, i: change(t))._replace(length=1))
+    assert np.isnan(found.correlation)
+    first, *others = doubts("s", found)
+    assert re.match(f"s: whether the targets belong to the frames cannot be told: {said}", first)
+    assert all("times as bright" in other or "move" in other for other in others)
 
 
 def test_pixels_that_are_not_finite_are_counted(shot):

@@ -15,7 +15,7 @@ LEAST_CORRELATION = 0.9
 SLOPES = 0.75, 4 / 3
 RATIOS = 0.8, 1.25
 PEAK = 1.15  # displaced by one pixel they fit 1.37 to 1.49 times as well where they belong
-_BLOCKS, _RELIABLE = 64, 0.5  # with fewer, or mostly noise, or a picture without any contrast, nothing is said
+_BLOCKS, _RELIABLE = 64, 0.5  # with fewer, or mostly noise, or a picture without any contrast, nothing can be told
 _BOX = 4  # radius; what is wider than this box says little about where things are
 
 
@@ -28,6 +28,7 @@ class Likeness(NamedTuple):
         ratio: mean of the targets / mean of the frames.
         displacement: (dx, dy), in whole pixels, by which the targets would have to move to fit best.
         frames_not_finite, targets_not_finite: pixels.
+        unknown: why the correlation cannot be told; "" where it can.
     """
 
     correlation: float
@@ -36,11 +37,13 @@ class Likeness(NamedTuple):
     displacement: tuple[int, int]
     frames_not_finite: int
     targets_not_finite: int
+    unknown: str = ""
 
 
 def likeness(shot: Shot) -> Likeness:
     """Read all frames and targets of a shot once, and compare them."""
     sums = np.zeros(2)
+    darkest, brightest = np.inf, -np.inf
     bad = [0, 0]
     means, noises, match = [], [], None
     for noisy, target in _pairs(shot):
@@ -49,15 +52,20 @@ def likeness(shot: Shot) -> Likeness:
         both = known[0] & known[1]
         images = [np.where(both, image, 0.0) for image in (noisy, target)]
         sums += [image.sum() for image in images]
+        darkest, brightest = (
+            pick(target, where=both, initial=so_far) for pick, so_far in ((np.min, darkest), (np.max, brightest))
+        )
         mean, noise = zip(*map(_blocks, images), strict=True)
         means.append(mean)
         noises.append(noise)
         match = _match(*images) + (0 if match is None else match)
     if match is None:
         return Likeness(np.nan, np.nan, np.nan, (0, 0), *bad)
-    correlation, slope = _related(np.concatenate(means, axis=1), np.concatenate(noises, axis=1))
+    correlation, slope, unknown = _related(np.concatenate(means, axis=1), np.concatenate(noises, axis=1))
+    if unknown and brightest - darkest <= 1e-3 * abs(brightest):
+        unknown = f"all pixels of the targets are {brightest:.3g}"
     ratio = float(sums[1] / sums[0]) if sums[0] > 0 else np.nan
-    return Likeness(correlation, slope, ratio, _displacement(match), *bad)
+    return Likeness(correlation, slope, ratio, _displacement(match), *bad, unknown)
 
 
 def doubts(name: str, found: Likeness) -> tuple[str, ...]:
@@ -70,6 +78,8 @@ def doubts(name: str, found: Likeness) -> tuple[str, ...]:
     if found.targets_not_finite:
         said.append(f"{name}: {found.targets_not_finite} pixels of the targets are not finite: they count for nothing")
     dx, dy = found.displacement
+    if found.unknown:
+        said.append(f"{name}: whether the targets belong to the frames cannot be told: {found.unknown}")
     if found.correlation < LEAST_CORRELATION:
         said.append(
             f"{name}: the targets do not look like the frames (block means correlate by {found.correlation:.2f}; "
@@ -114,18 +124,25 @@ def _blocks(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return blocks.mean(axis=1), blocks.var(axis=1) / BLOCK**2
 
 
-def _related(means: np.ndarray, noises: np.ndarray) -> tuple[float, float]:
-    """Correlation and slope of the logarithms, with the share of noise (Spearman's correction for attenuation) taken out."""
+def _related(means: np.ndarray, noises: np.ndarray) -> tuple[float, float, str]:
+    """Correlation and slope of the logarithms, with the share of noise (Spearman's correction for attenuation) taken out.
+
+    The third says why they are nan, "" where they are known.
+    """
     lit = (means > 1e-6).all(axis=0)
     if lit.sum() < _BLOCKS:
-        return np.nan, np.nan
+        size = f"{BLOCK} x {BLOCK} pixels"
+        return np.nan, np.nan, f"light is in {lit.sum()} blocks of {size} of both; wanted {_BLOCKS} or more"
     logs = np.log(means[:, lit])
     total, noise = logs.var(axis=1), (noises[:, lit] / means[:, lit] ** 2).mean(axis=1)
     picture = total - noise
-    if (picture < _RELIABLE * total).any() or (picture < 1e-3).any():
-        return np.nan, np.nan
+    for what, one, all_of_it in zip(("frames", "targets"), picture, total, strict=True):
+        if all_of_it < 1e-3:
+            return np.nan, np.nan, f"the {what} have no contrast"
+        if one < max(_RELIABLE * all_of_it, 1e-3):
+            return np.nan, np.nan, f"the {what} are mostly noise"
     covariance = np.mean((logs[0] - logs[0].mean()) * (logs[1] - logs[1].mean()))
-    return float(min(covariance / np.sqrt(picture.prod()), 1.0)), float(np.sqrt(picture[1] / picture[0]))
+    return float(min(covariance / np.sqrt(picture.prod()), 1.0)), float(np.sqrt(picture[1] / picture[0])), ""
 
 
 def _match(image: np.ndarray, target: np.ndarray) -> np.ndarray:

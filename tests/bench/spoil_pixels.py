@@ -24,7 +24,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import scenes  # noqa: E402
 from bridge import jitted_step, to_frame  # noqa: E402
-from compiling import compile_quickly  # noqa: E402
+from compiling import QUICK  # noqa: E402
 from hypothesis import HealthCheck, Phase, given, settings  # noqa: E402
 from hypothesis import seed as seeded  # noqa: E402
 
@@ -34,7 +34,6 @@ from svgf_jax.types import Frame, Params  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-compile_quickly()
 
 KINDS = {
     "NaN in a pixel": ("radiance", (0, 5, 5), np.nan),
@@ -74,7 +73,7 @@ def hold(property_of, count: int, seed: int) -> None:
 def forward(preset: str, count: int, seed: int, *, variance: bool) -> str:
     """The filter over so many sequences: how many, and the largest share of the bound."""
     params, config = ready(preset)
-    run = jax.jit(partial(denoise, config=config))
+    run = jax.jit(partial(denoise, config=config), compiler_options=dict(QUICK))
     shares = []
 
     def check(case):
@@ -95,7 +94,7 @@ def backward(preset: str, count: int, seed: int) -> str:
         _, output = denoise(frames._replace(radiance=radiance), params=params, config=config)
         return jnp.mean(output.image / (1.0 + jnp.abs(output.image)))
 
-    gradient = jax.jit(jax.grad(loss, argnums=(0, 1)))
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1)), compiler_options=dict(QUICK))
     done = []
 
     def check(case):
@@ -113,7 +112,7 @@ def backward(preset: str, count: int, seed: int) -> str:
 def recovery(preset: str, kind: str) -> int | None:
     """Frames after four bad ones until a wall of light 1 is within 5 % everywhere; None = not in 150."""
     params, config = ready(preset)
-    step = jitted_step(config)
+    step = jitted_step(config, QUICK)
     wall = to_frame(scenes.flat(*bad_pixels.SIZE, signals=2), np.float32)
     good = {name: values for name, values in wall._asdict().items() if values is not None}
     channel, where, value = KINDS[kind]
