@@ -28,9 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from svgf_jax.cells import Color, Pixels, from_centre, over_cells
+from svgf_jax.cells import Color, Corner, Pixels, at_centres, from_centre, gathered, spread, to_cells, to_pixels
 from svgf_jax.color import luminance_of_planes
-from svgf_jax.edges import Guides, depth_gradient, geometry_exponent, guides_of
+from svgf_jax.edges import NEVER, Guides, depth_gradient, geometry_exponent, guides_of
 from svgf_jax.sampling import (
     add_margin,
     in_strips,
@@ -149,10 +149,12 @@ def follow_light(
         tuple(planes(signal) for signal in previous.illumination),
         tuple(planes(signal) for signal in previous.moments),
     )
-    cells, sums = over_cells(partial(_gather, size=size, scalars=scalars), pixels, size=size)
+    cells, sums = to_cells(partial(_gather, size=size, scalars=scalars), pixels, size=size)
     corrections = _judge(cells, sums, size=size, scalars=scalars)
-    around = add_margin(Around(cells.guides, (cells.weight > _TINY).astype(frame.depth.dtype), corrections), 1, 1)
-    corrected = over_cells(partial(_apply, size=size, scalars=scalars), pixels._replace(current=()), around, size=size)
+    around = Around(cells.guides, (cells.weight > _TINY).astype(frame.depth.dtype), corrections)
+    corrected = to_pixels(
+        partial(_apply, scalars=scalars), pixels._replace(current=()), add_margin(around, 1, 1), size=size
+    )
     light, moments, change = zip(*corrected, strict=True)
     return previous._replace(illumination=stack_planes(light), moments=stack_planes(moments), change=jnp.stack(change))
 
@@ -162,7 +164,18 @@ def _brightest(dtype) -> float:
     return float(jnp.finfo(dtype).max) ** 0.25
 
 
-def _weight(p: Guides, q: Guides, slope: tuple[Array, Array], dy: Array, dx: Array, scalars: Params) -> Array:
+def _weight(
+    p: Guides,
+    q: Guides,
+    slope: tuple[Array, Array],
+    dy: Array,
+    dx: Array,
+    scalars: Params,
+    *,
+    where: Array,
+    log: Array | float = 0.0,
+) -> Array:
+    """w_z w_n exp(log), or 0. All goes in before the exp: its result is kept, whereas every sum would redo a product."""
     exponent = geometry_exponent(
         p,
         q,
@@ -171,30 +184,33 @@ def _weight(p: Guides, q: Guides, slope: tuple[Array, Array], dy: Array, dx: Arr
         sigma_normal=scalars.light_sigma_normal,
         depth_epsilon=scalars.depth_epsilon,
     )
-    return p.surface * q.surface * jnp.exp(exponent)
+    return jnp.exp(jnp.where(where, exponent + log, NEVER))
 
 
-def _gather(pixels: Pixels, _: None, *, size: int, scalars: Params) -> tuple[Cells, tuple[Sums, ...]]:
+def _gather(pixels: Pixels, *, size: int, scalars: Params) -> tuple[Cells, tuple[Sums, ...]]:
     """Sums over the cells' own pixels, weighted by likeness to the central one."""
     guides, slope, known, current, history, moments = pixels
-    centre = (size // 2) * (size + 1)
-    cell_guides, cell_slope = jax.tree.map(lambda a: a[centre], (guides, slope))
+    centre = jax.tree.map(partial(at_centres, size=size), (guides, slope))
+    p, p_slope = jax.tree.map(partial(spread, size=size), centre)
     distance = jnp.asarray(from_centre(size), known.dtype)
+    dx = jnp.asarray(np.tile(from_centre(size), known.shape[1] // size)[None], known.dtype)
 
-    def add(sums, phase):
-        q, with_history, colors, (dy, dx) = phase
-        weight = with_history * _weight(cell_guides, q, cell_slope, dy, dx, scalars)
+    def add(sums, row):
+        q, with_history, colors, dy = row
+        known = with_history * p.surface * q.surface > 0.0
+        weight = _weight(p, q, p_slope, dy, dx, scalars, where=known)
         weights, squares, totals = sums
         values = tuple(_compare(*pair) for pair in colors)
         totals = jax.tree.map(lambda total, value: total + weight * value, totals, values)
         return (weights + weight, squares + weight * weight, totals), None
 
     colors = tuple(zip(current, history, moments, strict=True))
-    zero = jnp.zeros(known.shape[1:], known.dtype)
+    zero = jnp.zeros_like(dx)
     nothing = tuple(Sums((zero,) * 3, (zero,) * 3, zero, zero, zero, zero) for _ in colors)
-    phases = guides, known, colors, (distance[:, 0], distance[:, 1])
-    (weight, square, totals), _ = lax.scan(add, (zero, zero, nothing), phases)
-    return Cells(cell_guides, cell_slope, weight, square), totals
+    rows = jax.tree.map(lambda a: a[:, None], (guides, known, colors))
+    sums, _ = lax.scan(add, (zero, zero, nothing), (*rows, distance))
+    weight, square, totals = jax.tree.map(partial(gathered, size=size), sums)
+    return Cells(centre[0], centre[1], weight, square), totals
 
 
 def _compare(current: Color, history: Color, moments) -> Sums:
@@ -257,8 +273,9 @@ def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, s
     away = jnp.asarray(_OFFSETS * size, cells.weight.dtype)
 
     def tap(sums, q, p, t):
-        dy, dx, h = t
-        weight = h * _weight(p["guides"], q["guides"], p["slope"], dy, dx, scalars)
+        dy, dx, log_h = t
+        q_guides = q["guides"]
+        weight = _weight(p["guides"], q_guides, p["slope"], dy, dx, scalars, where=q_guides.surface > 0.0, log=log_h)
         weights, squares, totals = q["state"]
         return (
             sums[0] + weight * weights,
@@ -274,8 +291,9 @@ def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, s
             neighbours={"guides": cells.guides, "state": state},
             centre={"guides": cells.guides, "slope": cells.slope},
             offsets=_OFFSETS,
-            per_tap=(distance[:, 0], distance[:, 1], jnp.asarray(kernel, away.dtype)),
+            per_tap=(distance[:, 0], distance[:, 1], jnp.asarray(np.log(kernel), away.dtype)),
             sums=jax.tree.map(lambda a: jnp.zeros((), a.dtype), state),
+            at_once=5,
             step_size=step_size,
             largest_step=2 ** (levels - 1),
         ), None
@@ -324,41 +342,26 @@ def _ratio(current: Array, previous: Array, scale: Array, significance: Array) -
     return 1.0 + jnp.where(lit, significance * (jnp.clip(ratio, 1.0 / LARGEST_GAIN, LARGEST_GAIN) - 1.0), 0.0)
 
 
-def _apply(pixels: Pixels, around: Around, *, size: int, scalars: Params):
+def _apply(pixels: Pixels, corners: list[Corner], *, scalars: Params):
     """Bring the corrections to the pixels, from the 2 x 2 cells whose central pixels surround each."""
-    rows, columns = pixels.known.shape[1:]
-    offset = from_centre(size)
-    first = np.where(offset < 0, -1, 0)  # of the two cells along an axis, relative to the pixel's own
-    fraction = offset / size - first
-    corners = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
-    cell = first[:, None] + corners  # [size^2, 4, 2]
-    share = np.where(corners == 1, fraction[:, None], 1.0 - fraction[:, None]).prod(axis=-1)
-    away = jnp.asarray(cell * size - offset[:, None], pixels.known.dtype)
-
-    def pixel(phase):
-        (p, slope, known, _, colors, pairs), corner, shares, away = phase
-
-        def add(sums, tap):
-            at, part, far = tap
-            q, knows, values = jax.tree.map(lambda a: lax.dynamic_slice(a, (at[0], at[1]), (rows, columns)), around)
-            weight = part * knows * _weight(p, q, slope, far[0], far[1], scalars)
-            return (sums[0] + weight, jax.tree.map(lambda s, v: s + weight * v, sums[1], values)), None
-
-        zero = jnp.zeros_like(known)
-        sums = (zero, jax.tree.map(lambda _: zero, around.corrections))
-        (weight, totals), _ = lax.scan(add, sums, (corner, shares, away), unroll=len(corners))
-        found = (weight > 1e-8) & (known > 0.0)
-        divisor = jnp.where(found, weight, 1.0)
-        corrected = [_correct(c, m, t, divisor) for c, m, t in zip(colors, pairs, totals, strict=True)]
-        as_it_was = tuple((c, m, zero) for c, m in zip(colors, pairs, strict=True))
-        return jax.tree.map(lambda new, old: jnp.where(found, new, old), tuple(corrected), as_it_was)
-
-    return lax.map(pixel, (pixels, jnp.asarray(cell + 1, jnp.int32), jnp.asarray(share, away.dtype), away))
+    p, slope, known, _, colors, pairs = pixels
+    weights = [
+        _weight(p, q.guides, slope, dy, dx, scalars, where=q.knows > 0.0, log=log_share)
+        for q, log_share, dy, dx in corners
+    ]
+    weight = weights[0] + weights[1] + weights[2] + weights[3]
+    found = (weight > 1e-8) & (known * p.surface > 0.0)
+    divisor = jnp.where(found, weight, 1.0)
+    a, b, c, d = (w / divisor for w in weights)
+    mean = lambda i, j, k, l: a * i + b * j + c * k + d * l  # noqa: E731, E741
+    corrections = jax.tree.map(mean, *(corner.cells.corrections for corner in corners))
+    corrected = [_correct(*given) for given in zip(colors, pairs, corrections, strict=True)]
+    as_it_was = tuple((c, m, jnp.zeros_like(known)) for c, m in zip(colors, pairs, strict=True))
+    return jax.tree.map(lambda new, old: jnp.where(found, new, old), tuple(corrected), as_it_was)
 
 
-def _correct(color: Color, moments: tuple[Array, Array], total: Correction, divisor: Array):
-    c = jax.tree.map(lambda t: t / divisor, total)
-    most = _brightest(divisor.dtype)
+def _correct(color: Color, moments: tuple[Array, ...], c: Correction):
+    most = _brightest(moments[0].dtype)
     corrected = tuple(_within(g, h, o, most) for g, h, o in zip(c.gain, color, c.offset, strict=True))
     first, second = moments
     noise = _within(c.keep, jnp.maximum(second - first * first, 0.0), c.variance, most * most)

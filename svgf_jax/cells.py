@@ -1,4 +1,8 @@
-"""Cells of size x size pixels, worked on in strips that stay in the cache: pixels in, cells or pixels out."""
+"""Cells of size x size pixels, worked on row by row so that all stays in the cache: pixels in, cells or pixels out.
+
+XLA:CPU computes with planes whose rows are read as they lie in memory. So nothing here is cut or spread along a row where it is
+computed with: a cell's values are brought to all pixels of a row first, and the sums of a row are added up by cells last.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,10 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from svgf_jax.edges import Guides
+from svgf_jax.edges import NEVER, Guides
 from svgf_jax.sampling import Planes, split_rows
-
-STRIP_CELLS = 4  # rows of cells whose pixels are in hand at once: the fastest of 1 to 16 at 1920 pixels width
 
 Color = tuple[Array, ...]  # red, green, blue
 
@@ -27,40 +29,104 @@ class Pixels(NamedTuple):
     moments: tuple[tuple[Array, ...], ...]
 
 
-def over_cells(function: Callable[..., Planes], pixels: Pixels, around: Planes = None, *, size: int) -> Planes:
-    """`function(pixels, around)` of a strip of cells after the other, so that all stays in the cache.
+class Corner(NamedTuple):
+    """One of the four cells whose central pixels surround a pixel, for some rows of pixels.
 
-    It gets the pixels as *phases* `[size^2, rows, w]`: entry a * size + b holds pixel (a, b) of every cell, 0 beyond the image; and
-    of `around`, planes of cells with a margin of 1, `[rows + 2, w + 2]`. It returns planes of cells `[rows, w]`, or phases again.
+    Attributes:
+        cells: what is known of it, planes `[n, w]`.
+        log_share: log of its bilinear weight, `[n, w]`.
+        dy, dx: from the pixel to its centre, `[n, 1]` and `[1, w]`.
+    """
+
+    cells: Planes
+    log_share: Array
+    dy: Array
+    dx: Array
+
+
+def to_cells(function: Callable[[Pixels], Planes], pixels: Pixels, *, size: int) -> Planes:
+    """`function` of one row of cells after the other: it gets their pixels, planes `[size, w size]`, and returns planes `[1, w]`.
+
+    Beyond the image the pixels are 0. Returns planes of cells.
+    """
+    down = -(-pixels.known.shape[0] // size)
+    found = lax.map(jax.checkpoint(function, prevent_cse=False), _split(pixels, size, size))  # type: ignore[arg-type]
+    return jax.tree.map(lambda a: a.reshape(-1, a.shape[-1])[:down], found)
+
+
+def to_pixels(
+    function: Callable[[Pixels, list[Corner]], Planes], pixels: Pixels, cells: Planes, *, size: int
+) -> Planes:
+    """`function(pixels, corners)` of some rows of pixels after the other, which lie between the same two rows of cells' centres.
+
+    Args:
+        function: planes of pixels `[n, w size]` and the four corners -> planes of pixels.
+        pixels: 0 beyond the image.
+        cells: planes of cells with a margin of 1, `[h + 2, w + 2]`.
+        size: of a cell.
+
+    Returns:
+        Planes of pixels.
     """
     height, width = pixels.known.shape
-    down, across = -(-height // size), -(-width // size)
-    count, rows = split_rows(down, across, STRIP_CELLS)
-    below = count * rows - down
-    around = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), around)
+    band = size // 2 if size % 2 == 0 else 1  # rows of pixels
+    split = _split(pixels, band, size)
+    count, _, columns = split.known.shape
+    dtype = pixels.known.dtype
+    # Spread here and not where they are read: the compiler would spread them anew for every use, and pixel by pixel.
+    cells = jax.tree.map(lambda a: spread(jnp.pad(a, ((0, size), (0, 0))), size), cells)
+    offset = from_centre(size)
+    first = np.where(offset < 0, -size, 0) - offset  # from a pixel to the first of the two cells' centres along an axis
+    with np.errstate(divide="ignore"):
+        log_share = np.maximum(np.log(np.stack([1 + first / size, -first / size])), NEVER)
+    along = lambda a: jnp.asarray(np.tile(a, columns // size)[None], dtype)  # noqa: E731
+    down = lambda a: jnp.asarray(np.resize(a, (count, band, 1)), dtype)  # noqa: E731
+    above = (np.arange(count) * band + size - size // 2) // size
 
-    def split(plane: Array) -> Array:
-        padded = jnp.pad(plane, ((0, (down + below) * size - height), (0, across * size - width)))
-        return padded.reshape(count, rows, size, across, size)
+    def rows(given: tuple[Pixels, tuple[Array, Array], Array, tuple[Array, Array]]) -> Planes:
+        pixels, cells_rows, dy, log_y = given
+        corners = []
+        for i, j in np.ndindex(2, 2):
+            corner = (cells_rows[i], jnp.int32(size - size // 2 + j * size))
+            read = lambda a, at=corner: jnp.broadcast_to(lax.dynamic_slice(a, at, (1, columns)), (band, columns))  # noqa: E731
+            log = log_y[i] + along(log_share[j])
+            corners.append(Corner(jax.tree.map(read, cells), log, dy + i * size, along(first + j * size)))
+        return function(pixels, corners)
 
-    def join(found: Array) -> Array:
-        if found.ndim == 2:
-            return found
-        return found.reshape(size, size, rows, across).transpose(2, 0, 3, 1).reshape(rows * size, across * size)
+    places = tuple(jnp.asarray(above + i, jnp.int32) for i in range(2))
+    given = split, places, down(first), tuple(map(down, log_share))
+    found = lax.map(jax.checkpoint(rows, prevent_cse=False), given)  # type: ignore[arg-type]
+    return jax.tree.map(lambda a: a.reshape(-1, columns)[:height, :width], found)
 
-    def strip(given: tuple[Array, Pixels]) -> Planes:
-        first, pixels = given
-        phases = jax.tree.map(lambda a: a.transpose(1, 3, 0, 2).reshape(size * size, rows, across), pixels)
-        near = jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, first, rows + 2), around)
-        return jax.tree.map(join, function(phases, near))
 
-    strips = jnp.arange(count, dtype=jnp.int32) * rows, jax.tree.map(split, pixels)
-    found = lax.map(jax.checkpoint(strip, prevent_cse=False), strips)  # type: ignore[arg-type]
-    crop = lambda a: a[:down] if a.shape[1] == across else a[:height, :width]  # noqa: E731
-    return jax.tree.map(lambda a: crop(a.reshape(-1, a.shape[-1])), found)
+def _split(pixels: Pixels, rows: int, size: int) -> Pixels:
+    """`[H, W]` -> `[count, rows, w size]`, 0 beyond the image."""
+    height, width = pixels.known.shape
+    across = -(-width // size) * size
+    count, _ = split_rows(-(-height // rows), across, 1)
+    pad = lambda a: jnp.pad(a, ((0, count * rows - height), (0, across - width)))  # noqa: E731
+    return jax.tree.map(lambda a: pad(a).reshape(count, rows, across), pixels)
+
+
+def at_centres(plane: Array, size: int) -> Array:
+    """The central pixels `[1, w]` of a row of cells."""
+    return plane[size // 2 : size // 2 + 1, size // 2 :: size]
+
+
+def spread(cells: Array, size: int) -> Array:
+    """`[n, w]` -> `[n, w size]`: each cell's value at every pixel of a row of it."""
+    rows, across = cells.shape
+    return jnp.broadcast_to(cells[:, :, None], (rows, across, size)).reshape(rows, across * size)
+
+
+def gathered(row: Array, size: int) -> Array:
+    """`[n, w size]` -> `[n, w]`: sums over the pixels of a row of each cell."""
+    total = row[:, ::size]
+    for b in range(1, size):
+        total = total + row[:, b::size]
+    return total
 
 
 def from_centre(size: int) -> np.ndarray:
-    """Offsets (dy, dx) of a cell's pixels from its central one, `[size^2, 2]`, in the order of the phases."""
-    reach = np.arange(size) - size // 2
-    return np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
+    """How far a cell's pixels are from its central one, along an axis, `[size]`."""
+    return np.arange(size) - size // 2
