@@ -15,6 +15,8 @@ MEET_WITHIN = 300  # seconds
 DEAD_AFTER = 30  # seconds without a sign of life
 _ASK_EVERY = 2000  # milliseconds
 _PATIENCE = 10  # seconds that process 0 waits for the others to leave
+_KEPT = ("client", "service", "process_id", "num_processes", "coordinator_address")
+_ASKED = ("key_value_set_bytes", "blocking_key_value_get_bytes", "get_live_nodes", "shutdown")
 
 
 class Process(NamedTuple):
@@ -62,11 +64,11 @@ def meet(
     check_meeting(True, coordinator, processes, process)
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # else the runtime warns of what is meant here
     import jax
-    from jax._src.distributed import global_state as state  # nothing public tells this without making a backend
 
-    # Otherwise one that dies ends all others, without a word of what to do.
-    jax.config.update("jax_enable_recoverability", True)
+    state = _state()
     try:
+        # Otherwise one that dies ends all others, without a word of what to do.
+        jax.config.update("jax_enable_recoverability", True)
         jax.distributed.initialize(
             coordinator,
             processes,
@@ -75,6 +77,8 @@ def meet(
             initialization_timeout=within,
             heartbeat_timeout_seconds=dead_after,
         )
+    except (AttributeError, TypeError) as error:
+        raise _other_jax(str(error)) from error
     except ValueError as error:
         raise SvgfError(
             f"Nothing here tells which of several processes this is ({error}). Start it under Slurm, Kubernetes or MPI, or say: "
@@ -85,11 +89,39 @@ def meet(
             f"The processes did not all meet at {state.coordinator_address} within {within} s ({str(error).splitlines()[0]}). "
             "Start all of them, with one address of process 0 that the others can reach."
         ) from error
+    _require(state.client, _ASKED)
     me = Process(state.process_id, int(state.num_processes or 1), state.client, state.service)
     # From here on JAX knows this process alone.
     state.client = state.service = None
     state.process_id, state.num_processes = 0, 1
     return me
+
+
+def _state() -> Any:
+    """Where JAX keeps the client of its runtime. Nothing public gives that, or which process this is without making a backend.
+
+    Raises SvgfError: this JAX keeps it elsewhere.
+    """
+    try:
+        from jax._src.distributed import global_state
+    except ImportError as error:
+        raise _other_jax(str(error)) from error
+    _require(global_state, _KEPT)
+    return global_state
+
+
+def _require(thing: object, names: tuple[str, ...]) -> None:
+    if missing := [name for name in names if not hasattr(thing, name)]:
+        raise _other_jax(f"{type(thing).__name__} has no {', '.join(missing)}")
+
+
+def _other_jax(why: str) -> SvgfError:
+    from jax import __version__
+
+    return SvgfError(
+        f"Several processes cannot meet by JAX {__version__}, which is made in another way than wanted ({why}). They can by JAX "
+        "0.10 to 0.12; or leave out --distributed, and give each process its own frames (--frames)."
+    )
 
 
 def gather(me: Process, name: str, mine: bytes) -> list[bytes]:

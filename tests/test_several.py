@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -200,3 +201,23 @@ def test_processes_that_never_meet(monkeypatch):
         processes.meet("127.0.0.1:1", 2, 1, within=5)
     monkeypatch.undo()
     assert processes.gather(processes.Process(), "alone", b"x") == [b"x"]
+
+
+def test_a_jax_that_keeps_its_runtime_elsewhere_is_told(monkeypatch):
+    state = types.SimpleNamespace(client=None, process_id=0, num_processes=None, coordinator_address=None)
+    for target, value, said in [
+        ("global_state", state, "SimpleNamespace has no service"),
+        ("global_state", None, "NoneType has no client, service"),
+        (None, None, "distributed"),
+    ]:
+        with monkeypatch.context() as patch:
+            if target:
+                patch.setattr(f"jax._src.distributed.{target}", value)
+            else:
+                patch.setitem(sys.modules, "jax._src.distributed", None)
+            with pytest.raises(SvgfError, match=f"cannot meet by JAX .*{said}.*0.10 to 0.12.*--frames"):
+                processes.meet("127.0.0.1:1", 2, 1)
+    with monkeypatch.context() as patch:
+        patch.setattr("jax.distributed.initialize", lambda *args: None)  # knows no such options
+        with pytest.raises(SvgfError, match=r"cannot meet by JAX .*unexpected keyword"):
+            processes.meet("127.0.0.1:1", 2, 1)
