@@ -60,12 +60,12 @@ def likeness(shot: Shot) -> Likeness:
         noises.append(noise)
         match = _match(*images) + (0 if match is None else match)
     if match is None:
-        return Likeness(np.nan, np.nan, np.nan, (0, 0), *bad)
+        return Likeness(np.nan, np.nan, np.nan, (0, 0), bad[0], bad[1])
     correlation, slope, unknown = _related(np.concatenate(means, axis=1), np.concatenate(noises, axis=1))
     if unknown and brightest - darkest <= 1e-3 * abs(brightest):
         unknown = f"all pixels of the targets are {brightest:.3g}"
     ratio = float(sums[1] / sums[0]) if sums[0] > 0 else np.nan
-    return Likeness(correlation, slope, ratio, _displacement(match), *bad, unknown)
+    return Likeness(correlation, slope, ratio, _displacement(match), bad[0], bad[1], unknown)
 
 
 def doubts(name: str, found: Likeness) -> tuple[str, ...]:
