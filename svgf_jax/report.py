@@ -4,18 +4,16 @@ Pictures are shown of at most `MOST` frames, evenly spread, and share a budget o
 however long the sequence is. What is not known of a frame is left out or said to be unknown.
 """
 
-import importlib.metadata
 import json
 import math
-import platform
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from svgf_jax import __version__, checkpoint, exr, frames, metrics, page
+from svgf_jax import checkpoint, exr, frames, metrics, page, pieces
 from svgf_jax.ablation import Measured
 from svgf_jax.comparison import Pair
 from svgf_jax.outputs import WriteOptions, beauty, numbers
@@ -91,7 +89,7 @@ def run_page(run: Run, summary: Summary, *, repairs: Callable[[Mapping[str, int]
     repaired = [math.nan if one is None else float(sum(one.values())) for one in counts]
     length = [_number(one.get("history")) for one in known]
     curves = [
-        *_curves(x, scores, "denoised", _noisy_line(shown)),
+        *pieces.curves(x, scores, "denoised", _noisy_line(shown)),
         page.plot([Line("seconds", x, seconds)], title="done after, seconds (the first compiles)", frames=x),
         page.plot([Line("pixels", x, repaired)], title="pixels repaired", frames=x),
         page.plot([Line("frames", x, length)], title="mean history length, frames", frames=x),
@@ -120,19 +118,19 @@ def run_page(run: Run, summary: Summary, *, repairs: Callable[[Mapping[str, int]
         ("device", summary.device or "nothing was left to compute"),
         ("seconds, this run", f"{summary.seconds:.1f}"),
         *_speed(each),
-        ("pictures", _pictures_of(shown, len(done))),
+        ("pictures", pieces.pictures_of(shown, len(done))),
     ]
     return page.document(
         f"{Path(sequence.name).name}: {run.method}, {run.preset}",
         [
-            _title(sequence.name, f"denoised by {run.method}, {run.preset}"),
+            pieces.title(sequence.name, f"denoised by {run.method}, {run.preset}"),
             page.listed(notes),
             page.viewer(shown, left="noisy", right="denoised", legends=legends(run.params._asdict())),
-            _plots(curves),
-            _folded("Every frame", page.table(heads, rows)),
+            pieces.plots(curves),
+            pieces.folded("Every frame", page.table(heads, rows)),
             f"<h2>Which channel plays which role</h2><pre>{page.escape(run.source.roles.describe())}</pre>",
-            _parameters(numbers(run.params, run.config)),
-            _versions(told),
+            pieces.parameters(numbers(run.params, run.config)),
+            pieces.versions(told),
         ],
     )
 
@@ -169,9 +167,9 @@ def compare_page(
     earlier = {pair.number: score for pair, score in zip(old, metrics.score_frames(read), strict=True) if score}
     if len(old) < len(pairs):  # not consecutive
         earlier = {number: score._replace(temporal=math.nan) for number, score in earlier.items()}
-    curves = _curves(x, scores, "result", {"before": earlier} if earlier else {})
+    curves = pieces.curves(x, scores, "result", {"before": earlier} if earlier else {})
     curves += [
-        page.plot(_lines(x, scores, "result", field, {"before": earlier}), title=name, frames=x, named=True)
+        page.plot(pieces.lines(x, scores, "result", field, {"before": earlier}), title=name, frames=x, named=True)
         for field, name in (("relmse", "relMSE"), ("ssim", "SSIM"), ("flip", "HDR-FLIP"))
     ]
     told = [
@@ -180,13 +178,13 @@ def compare_page(
     return page.document(
         title,
         [
-            _title(title, f"{len(pairs)} frames against their reference"),
+            pieces.title(title, f"{len(pairs)} frames against their reference"),
             page.listed(notes),
             page.viewer(shown, left="result", right="reference", legends=legends(found.get("parameters"))),
-            _plots(curves),
-            _folded("Every frame", page.table(*table)),
-            _parameters(_recorded(attributes)) if attributes else "",
-            _versions([*told, ("pictures", _pictures_of(shown, len(pairs)))]),
+            pieces.plots(curves),
+            pieces.folded("Every frame", page.table(*table)),
+            pieces.parameters(_recorded(attributes)) if attributes else "",
+            pieces.versions([*told, ("pictures", pieces.pictures_of(shown, len(pairs)))]),
         ],
     )
 
@@ -247,18 +245,18 @@ def ablation_page(
             follow=True,
         ),
     ]
-    told = [("pictures", _pictures_of(shown, len(frames_of))), ("rows", str(len(found)))]
+    told = [("pictures", pieces.pictures_of(shown, len(frames_of))), ("rows", str(len(found)))]
     return page.document(
         title,
         [
-            _title(title, "What each part of the filter is worth: each row differs from the base in one thing."),
+            pieces.title(title, "What each part of the filter is worth: each row differs from the base in one thing."),
             page.listed(notes),
             page.table(*table),
             page.viewer(shown, left=found[0].row.name, right=found[-1].row.name, legends=legends()),
-            _plots(curves),
+            pieces.plots(curves),
             f"<h2>Which channel plays which role</h2><pre>{page.escape(roles)}</pre>",
-            _parameters(values),
-            _versions(told),
+            pieces.parameters(values),
+            pieces.versions(told),
         ],
     )
 
@@ -296,40 +294,19 @@ def _noisy(item: frames.LoadedFrame) -> np.ndarray:
 
 
 def _recorded(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters and choices that an output's header says; {} where it does not."""
+    """The parameters and choices that an output's header says, as `outputs.numbers` writes them; {} where it says none such."""
     try:
         found = json.loads(str(attributes.get("svgf_jax:parameters", "{}")))
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
 
+    def sound(name: str, table: object) -> bool:
+        kinds = int | float if name == "parameters" else int | float | str
+        values = list(table.values()) if isinstance(table, dict) else [None]
+        each = [one for value in values for one in (value if isinstance(value, list) else [value])]
+        return all(isinstance(one, kinds) and len(str(one)) < 100 for one in each)
 
-def _curves(
-    x: Sequence[int],
-    scores: Sequence[metrics.Scores | None],
-    name: str,
-    others: Mapping[str, Mapping[int, metrics.Scores]],
-) -> list[str]:
-    """PSNR and temporal error, where there are references; `others`: the scores of what it is compared with, by frame number."""
-    if not any(score is not None for score in scores):
-        return []
-    return [
-        page.plot(_lines(x, scores, name, field, others), title=title, frames=x, named=True)
-        for field, title in (("psnr", "PSNR, dB"), ("temporal", "temporal error"))
-    ]
-
-
-def _lines(
-    x: Sequence[int],
-    scores: Sequence[metrics.Scores | None],
-    name: str,
-    field: str,
-    others: Mapping[str, Mapping[int, metrics.Scores]],
-) -> list[Line]:
-    """What it is compared with first; lines without a finite value are left out."""
-    lines = [Line(other, list(of), _values(list(of.values()), field)) for other, of in others.items()]
-    lines.append(Line(name, x, _values(scores, field)))
-    return [line for line in lines if any(map(math.isfinite, line.y))]
+    return found if isinstance(found, dict) and all(sound(*entry) for entry in found.items()) else {}
 
 
 def _noisy_line(shown: Sequence[Shown]) -> dict[str, dict[int, metrics.Scores]]:
@@ -357,10 +334,6 @@ def _speed(seconds: Sequence[float]) -> list[tuple[str, str]]:
     ]
 
 
-def _values(scores: Sequence[metrics.Scores | None], field: str) -> list[float]:
-    return [math.nan if score is None else float(getattr(score, field)) for score in scores]
-
-
 def _score_cells(score: metrics.Scores | None) -> tuple[str, str]:
     if score is None:
         return "", ""
@@ -374,46 +347,3 @@ def _cells(seconds: float, repaired: float, history: float) -> tuple[str, ...]:
 
 def _number(value: Any) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
-
-
-def _title(title: str, below: str) -> str:
-    return f"<h1>{page.escape(title)}</h1><p>{page.escape(below)}</p>"
-
-
-def _plots(plots: Iterable[str]) -> str:
-    drawn = "".join(plots)
-    return f'<h2>Frame by frame</h2><div class="plots">{drawn}</div>' if drawn else ""
-
-
-def _folded(title: str, content: str) -> str:
-    return f"<details><summary>{page.escape(title)}</summary>{content}</details>"
-
-
-def _pictures_of(shown: Collection[Shown], count: int) -> str:
-    if len(shown) == count:
-        return f"of all {count} frames"
-    return f"of {len(shown)} of {count} frames, evenly spread: {format_range([frame.number for frame in shown])}"
-
-
-def _parameters(values: Mapping[str, Any]) -> str:
-    """Numbers and choices, as `outputs.numbers` gives them."""
-
-    def short(value: Any) -> str:
-        if isinstance(value, list):
-            return ", ".join(map(short, value))
-        return f"{value:.6g}" if isinstance(value, float) else str(value).lower()
-
-    both = {**values.get("parameters", {}), **values.get("config", {})}
-    rows = [(name, short(value)) for name, value in both.items()]
-    return f"<h2>Parameters</h2>{page.table(('parameter', 'value'), rows, words=True)}" if rows else ""
-
-
-def _versions(told: Sequence[tuple[str, object]]) -> str:
-    """Facts, and with which versions they came about: those of packages that are installed."""
-    versions = [("svgf_jax", __version__), ("Python", platform.python_version()), ("system", platform.platform())]
-    for name in ("jax", "numpy", "OpenEXR"):
-        try:
-            versions.append((name, importlib.metadata.version(name)))
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return f"<h2>Run and versions</h2>{page.table(('', ''), [*told, *versions], words=True)}"

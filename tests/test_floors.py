@@ -30,7 +30,7 @@ FLOORS = [
     {"advising", "planes", "camera_files", "geometry"},
     {"assembly"},
     {"arrays", "frames", "references", "pipeline", "checkpoint", "page"},
-    {"baselines", "comparison", "devices", "film", "outputs", "plan", "scan", "shown", "tev"},
+    {"baselines", "comparison", "devices", "film", "outputs", "plan", "scan", "shown", "tev", "pieces"},
     {"compiled", "estimates"},
     {"ablation", "streaming"},
     {"demo", "report", "inspection"},

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from shots import init, step, write_shot
 
-from svgf_jax import checkpoint, exr, metrics, page, report, streaming
+from svgf_jax import checkpoint, exr, metrics, page, pieces, report, streaming
 from svgf_jax.cli import main
 from svgf_jax.commands import terminal
 from svgf_jax.frames import open_source
@@ -277,10 +277,10 @@ def test_held_frames_are_shown_without_an_input(tmp_path):
 def test_curves_have_colours_and_names_by_what_they_are():
     """Grey is what a result is compared with; a result alone has its colour, and its name where that tells something."""
     before, after = (metrics.Scores(psnr, 0.1, 0.9, float("nan"), float("nan")) for psnr in (20.0, 30.0))
-    lines = report._lines([1], [after], "result", "psnr", {"before": {1: before}})
+    lines = pieces.lines([1], [after], "result", "psnr", {"before": {1: before}})
     both = page.plot(lines, title="t", named=True)
     assert '<span class="key k0">before</span><span class="key k1">result</span>' in both
-    alone = page.plot(report._lines([1], [after], "result", "temporal", {"before": {1: before}}), title="t", named=True)
+    alone = page.plot(pieces.lines([1], [after], "result", "temporal", {"before": {1: before}}), title="t", named=True)
     assert alone == ""  # no temporal error of one frame
     alone = page.plot(lines[1:], title="t", named=True)
     assert '<span class="key k1">result</span>' in alone
@@ -302,3 +302,20 @@ def test_a_page_without_flip_says_so():
     for names, lacks in ((("difference",), True), (("difference", "FLIP"), False), (("variance",), False)):
         shown = [page.Shown(1, {"result": ""}, {"result": dict.fromkeys(names, "")})]
         assert ("No FLIP maps" in page.viewer(shown, left="result", right="result", legends={})) == lacks
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 5000,
+        "7",
+        '{"parameters": 7}',
+        '{"parameters": {"max_history": "x"}}',
+        '{"config": {"a": [[1]]}}',
+        '{"parameters": {"a": 1' + "0" * 200 + "}}",
+        "{",
+    ],
+)
+def test_what_a_header_says_of_its_parameters_is_believed_only_if_it_can_be(text):
+    assert report._recorded({"svgf_jax:parameters": text}) == {}
+    assert report._recorded({"svgf_jax:parameters": '{"parameters": {"a": [1, 2.5]}, "config": {"b": true}}'})["config"]
