@@ -1,4 +1,4 @@
-"""Which small changes of the stages do the tests not notice? Mutants of six files, drawn at random, each run against the tests.
+"""Which small changes of the stages do the tests not notice? Mutants of nine files, drawn at random, each run against the tests.
 
 A mutant is one file with one change: an operator, a comparison, a number, a condition (operators of cosmic-ray, which this needs:
 `pip install cosmic-ray`), or of what JAX code is made of (maximum for minimum, the branches of `where` exchanged, floor for ceil,
@@ -33,6 +33,7 @@ from types import FunctionType, ModuleType
 ROOT = Path(__file__).parents[2]
 LIMIT_S = 60
 STAGES = "tests/test_stages_oracle.py::test_"
+FOLLOWED = "tests/test_adaptation.py::test_"
 # For each file: its tests, the quickest and most telling first.
 TESTS = {
     "color": [f"{STAGES}luminance", f"{STAGES}demodulate", f"{STAGES}remodulate", "tests/test_color.py"],
@@ -59,6 +60,15 @@ TESTS = {
         "tests/test_measured_variance.py::test_measured_variances_against",
     ],
     "atrous": [f"{STAGES}atrous", f"{STAGES}feedback", f"{STAGES}the_plain", f"{STAGES}backs"],
+    "adaptation": [
+        "tests/test_light_mutants.py::test_by_hand",
+        f"{FOLLOWED}the_stage",
+        f"{FOLLOWED}the_effective",
+        f"{FOLLOWED}without",
+        f"{FOLLOWED}it_is_diff",
+    ],
+    "cells": ["tests/test_light_mutants.py::test_by_hand", f"{FOLLOWED}the_stage"],
+    "reflections": ["tests/test_light_mutants.py::test_by_hand", "tests/test_reflections.py"],
 }
 # Asked of all, last: the whole.
 LAST = [f"{STAGES}step", "tests/test_outliers.py::test_remove"]
@@ -173,10 +183,10 @@ def mutants_of(text: str, draw: random.Random) -> list[tuple]:
     ]
 
 
-def drawn(of_each: int, seed: int) -> list[dict]:
+def drawn(of_each: int, seed: int, only: list[str]) -> list[dict]:
     """The sample: so many of each file, all in one random order."""
     draw, chosen = random.Random(seed), []
-    for name in TESTS:
+    for name in only:
         text = (ROOT / "svgf_jax" / f"{name}.py").read_text(encoding="utf-8")
         found = mutants_of(text, draw)
         print(f"{name}: {len(found)} mutants", flush=True)
@@ -332,7 +342,7 @@ def logged(log: Path) -> dict[tuple, dict]:
     return {key(mutant): mutant for mutant in map(json.loads, lines)}
 
 
-def campaign(of_each: int, seed: int, log: Path, *, again: bool) -> None:
+def campaign(of_each: int, seed: int, log: Path, *, again: bool, only: list[str]) -> None:
     """Run what the log does not hold yet; `again`: only what it holds as survived."""
     done = logged(log)
     survived = {known for known, mutant in done.items() if mutant["by"] is None}
@@ -346,7 +356,7 @@ def campaign(of_each: int, seed: int, log: Path, *, again: bool) -> None:
         answer = worker.ask({})
         print("unchanged:", answer, flush=True)
         assert answer["by"] is None, "the tests fail without any mutant"
-        for mutant in drawn(of_each, seed):
+        for mutant in drawn(of_each, seed, only):
             text = mutant.pop("text")
             if key(mutant) not in survived if again else key(mutant) in done:
                 continue
@@ -371,6 +381,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--of-each", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", nargs="+", choices=TESTS, default=list(TESTS))
     parser.add_argument("--log", type=Path, default=Path("mutants.jsonl"))
     parser.add_argument("--again", action="store_true")
     parser.add_argument("--tell", action="store_true")
@@ -381,4 +392,4 @@ if __name__ == "__main__":
     elif chosen.tell:
         tell(chosen.log)
     else:
-        campaign(chosen.of_each, chosen.seed, chosen.log, again=chosen.again)
+        campaign(chosen.of_each, chosen.seed, chosen.log, again=chosen.again, only=chosen.only)
