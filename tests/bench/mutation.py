@@ -271,7 +271,7 @@ class Runner:
             mutant = json.loads(line)
             started, failed = time.process_time(), None
             wanted = [
-                *(TESTS[mutant["file"]] if "file" in mutant else [t for tests in TESTS.values() for t in tests]),
+                *(test for name in mutant.get("only") or [mutant["file"]] for test in TESTS[name]),
                 *LAST,
             ]
             tests = list(dict.fromkeys(i for test in wanted for i in self.items if i.nodeid.startswith(test)))
@@ -353,7 +353,7 @@ def campaign(of_each: int, seed: int, log: Path, *, again: bool, only: list[str]
             (tree / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, tree / name)
         worker = Worker(tree)
-        answer = worker.ask({})
+        answer = worker.ask({"only": only})
         print("unchanged:", answer, flush=True)
         assert answer["by"] is None, "the tests fail without any mutant"
         for mutant in drawn(of_each, seed, only):
