@@ -165,9 +165,11 @@ def load_run(state: Path) -> tuple[Identity, bool] | None:
     path = state / "run.json"
     try:
         record = json.loads(_text(path))
-        if record["format"] != FORMAT or not isinstance(record["identity"]["frames"], list):
-            raise ValueError(f"format {record['format']}, wanted {FORMAT}")
-        return record["identity"], bool(record["complete"])
+        if record["format"] != FORMAT:
+            raise ValueError(f"format {record['format']!r}, wanted {FORMAT}")
+        if not isinstance(record["identity"]["frames"], list) or not isinstance(record["complete"], bool):
+            raise ValueError("incomplete")
+        return record["identity"], record["complete"]
     except FileNotFoundError:
         return None
     except Exception as error:  # a damaged file may raise anything

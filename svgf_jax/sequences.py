@@ -240,13 +240,16 @@ def _near(pattern: str) -> str:
 def _list(folder: str) -> list[str]:
     """The names in a folder, hidden ones (unfinished output) left out; none if it cannot be read.
 
-    Raises SvgfError: an EXR file whose name could steer a terminal, or pass for lines of a message.
+    Raises SvgfError: an EXR file whose name could steer a terminal, or pass for lines of a message, or is not UTF-8.
     """
     try:
         names = sorted(name for name in os.listdir(folder or ".") if not name.startswith("."))
     except OSError:
         return []
-    odd = {name for name in names if re.search(r"[\x00-\x1f\x7f-\x9f]", name)}
+    odd = {
+        name for name in names if re.search(r"[\x00-\x1f\x7f-\x9f\udc80-\udcff]", name)
+    }  # or bytes that are no UTF-8
     if files := sorted(name for name in odd if name.lower().endswith(".exr")):
-        raise SvgfError(f"{folder or '.'}: control characters in the name {files[0]!r}; rename it.")
+        what = "bytes that are not UTF-8" if re.search(r"[\udc80-\udcff]", files[0]) else "control characters"
+        raise SvgfError(f"{folder or '.'}: {what} in the name {files[0]!r}; rename it.")
     return [name for name in names if name not in odd]

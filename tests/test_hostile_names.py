@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 
 import browser
 import numpy as np
@@ -205,3 +206,25 @@ def test_a_checkpoint_is_data_only(tmp_path):
     with pytest.raises(SvgfError, match="checkpoint"):
         checkpoint.load_checkpoint(state, {"frames": []})
     assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.parametrize("run", [main, tune_main])
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("", "Got '' as argument 3; wanted something there"),
+        ("--out=", "argument 3"),
+        ("a\udcff", r"'a\\udcff': not UTF-8"),
+    ],
+)
+def test_arguments_that_no_name_can_be_are_refused(run, argument, said, capsys):
+    with pytest.raises(SystemExit):
+        run(["denoise", "in", argument])
+    assert re.search(said, capsys.readouterr().err)
+
+
+def test_a_name_that_is_not_utf8_is_refused_before_the_work(tmp_path):
+    write_shot(tmp_path, (1,))
+    (tmp_path / "shot.0001.exr").rename(tmp_path / "a\udcff.0001.exr")
+    with pytest.raises(SvgfError, match=r"bytes that are not UTF-8 in the name 'a\\udcff.0001.exr'; rename it"):
+        find_sequence(tmp_path)

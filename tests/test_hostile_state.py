@@ -61,3 +61,12 @@ def test_lines_that_no_run_wrote_count_for_nothing(tmp_path):
     (tmp_path / "frames.jsonl").write_text("\n".join([sound, *wrong]))
     assert checkpoint.load_figures(tmp_path)[7]["counts"] == {"normal": 3}
     assert list(checkpoint.load_figures(tmp_path)) == [7]
+
+
+@pytest.mark.parametrize(
+    "record", ['{"format": 1, "complete": "no", "identity": {"frames": []}}', "[" * 10_000, "null", "7"]
+)
+def test_a_record_that_no_run_wrote_is_refused(tmp_path, record):
+    (tmp_path / "run.json").write_text(record)
+    with pytest.raises(SvgfError, match="run.json: it is damaged or of another version"):
+        checkpoint.load_run(tmp_path)

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -44,12 +45,18 @@ def tell(text: str) -> None:
 
 
 def require_lines(arguments: Iterable[str]) -> None:
-    """SvgfError for an argument of several lines: a file's or folder's name that would pass for lines of a message."""
-    for argument in arguments:
+    """SvgfError for an argument of several lines: a file's or folder's name that would pass for lines of a message; for one
+    that is not UTF-8, which outputs could not keep; and for an empty one: `-o ""` would be the current folder.
+    """
+    for number, argument in enumerate(arguments, 1):
         if "\n" in argument:
             raise SvgfError(
                 f"Got {argument!r}: a line break in an argument. If it is in a name, rename the file or folder."
             )
+        if any("\udc80" <= letter <= "\udcff" for letter in argument):
+            raise SvgfError(f"Got {argument!r}: not UTF-8. If it is a name, rename the file or folder.")
+        if not argument.strip() or re.fullmatch("--[a-z-]+=", argument):
+            raise SvgfError(f"Got {argument!r} as argument {number}; wanted something there. Is a variable not set?")
 
 
 def _forgiving(stream: Any) -> Any:
