@@ -161,12 +161,16 @@ def find_start(plan: Plan, *, resume: bool, overwrite: bool) -> Checkpoint | Non
     """
     if resume and overwrite:
         raise SvgfError("Got both resume and overwrite: one continues a run, the other starts it again. Choose one.")
+    if folders := [path for path in written(plan) if os.path.isdir(path)]:
+        raise SvgfError(
+            f"{_list(folders)} in {plan.out}: a folder in the place of an output; remove it, or choose another."
+        )
     return _resume(plan) if resume else _start(plan, overwrite=overwrite)
 
 
 def check_writable(out: Path) -> None:
     """Raise SvgfError where the folder `out` could not be made or written into. Writes nothing."""
-    there = next(path for path in (out, *out.absolute().parents) if is_there(path))
+    there = next(path for path in (out, *out.absolute().parents) if is_there(path) or os.path.islink(path))
     if not (os.path.isdir(there) and os.access(there, os.W_OK | os.X_OK)):
         reason = "not writable" if os.path.isdir(there) else "not a folder"
         raise SvgfError(

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from svgf_jax import SvgfError, checkpoint, streaming
-from svgf_jax.plan import locked, make_plan
+from svgf_jax.plan import check_writable, find_start, locked, make_plan
 
 
 def test_a_missing_frame_is_not_held_in_a_folder_that_is_anothers_by_now(tmp_path):
@@ -20,6 +20,22 @@ def test_a_missing_frame_is_not_held_in_a_folder_that_is_anothers_by_now(tmp_pat
         with pytest.raises(SvgfError, match="the output folder was removed"):
             streaming._fill_gap(plan, still, 1)
     assert not plan.outputs[1].exists()
+
+
+def test_a_folder_in_the_place_of_an_output_is_known_before_the_first_is_written(tmp_path):
+    (tmp_path / "a_1.exr").touch()
+    files = [(1, str(tmp_path / "a_1.exr"))]
+    plan = make_plan(files, tmp_path / "out", hold=True, png=True, video=False, identity={})
+    (plan.out / "a_1.png").mkdir(parents=True)
+    for options in ({"overwrite": True, "resume": False}, {"overwrite": False, "resume": True}):
+        with pytest.raises(SvgfError, match="a_1.png in .*: a folder in the place of an output"):
+            find_start(plan, **options)
+
+
+def test_a_link_to_nowhere_is_no_output_folder(tmp_path):
+    (tmp_path / "out").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(SvgfError, match="out is not a folder"):
+        check_writable(tmp_path / "out")
 
 
 @pytest.mark.parametrize("put", ["pipe", "device"])
