@@ -48,6 +48,9 @@ def require_lines(arguments: Iterable[str]) -> None:
     """SvgfError for an argument of several lines: a file's or folder's name that would pass for lines of a message; for one
     that is not UTF-8, which outputs could not keep; and for an empty one: `-o ""` would be the current folder.
     """
+    arguments = list(arguments)
+    if arguments[:1] == ["__complete"]:  # a shell asks, in the midst of a word or before one
+        return
     for number, argument in enumerate(arguments, 1):
         if "\n" in argument:
             raise SvgfError(
