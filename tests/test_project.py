@@ -87,6 +87,8 @@ def test_the_nearest_file_above_is_taken(tmp_path):
         ("[denoise]\nset = false", "svgf-jax.toml:2: set = false; wanted a list of texts, or a table"),
         ("[denoise]\nfps = 'fast'", "svgf-jax.toml:2: fps = fast; wanted a number."),
         ("[denoise]\nframes = 5", 'svgf-jax.toml:2: frames = 5; wanted a text: frames = "5".'),
+        ('[denoise]\nout = "a\\u0000b"', "svgf-jax.toml:2: out = 'a\\x00b'; wanted a text, not empty, without control"),
+        ("[denoise]\nchannel = ['']", "svgf-jax.toml:2: channel = ['']; wanted a text, not empty"),
         ("[denoise]\ndevices = 1.5", "svgf-jax.toml:2: devices = 1.5; wanted a whole number."),
         ("[denoise]\nchannel = [1]", "svgf-jax.toml:2: channel = 1; wanted a list of texts, or a table."),
         ("[denoise]\nset = { alpha = { x = 1 } }", "svgf-jax.toml:2: set = "),

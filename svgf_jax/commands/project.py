@@ -122,6 +122,8 @@ def _apply(
                 _located(text, name, options[name].hint, file)
                 for text in _texts(name, value, options[name].hint, where)
             ]
+            if any(not text.strip() or min(text) < " " for text in texts):  # `out = ""` would be the current folder
+                raise SvgfError(f"{where}: {name} = {value!r}; wanted a text, not empty, without control characters.")
             if name in hidden:
                 continue
             for index, text in enumerate(texts):
