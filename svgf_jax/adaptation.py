@@ -43,6 +43,7 @@ from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
 
 GAIN_LEVELS = 3  # a-trous levels on the grid of cells: reach of +-14 cells
 OFFSET_LEVELS = 1  # +-2 cells
+MANY_CELLS = 2**16  # from here on a quicker loop is worth a longer compilation
 LARGEST_GAIN = 50.0
 _OFFSETS = square_offsets(2)
 _B3 = np.array([1, 4, 6, 4, 1]) / 16.0  # the B3 spline
@@ -223,9 +224,10 @@ def _compare(current: Color, history: Color, moments) -> Sums:
 
 def _judge(cells: Cells, sums: tuple[Sums, ...], *, size: int, scalars: Params) -> tuple[Correction, ...]:
     """Steps 1 and 2 of the module's docstring, on the grid of cells."""
-    ones, zeros = jnp.ones_like(cells.weight), jnp.zeros_like(cells.weight)
-    start = tuple(Correction((ones,) * 3, (zeros,) * 3, ones, ones, zeros) for _ in sums)
-    wide = _pool(cells, in_strips(_correct_sums, sums, start), levels=GAIN_LEVELS, size=size, scalars=scalars)
+    one, zero = (jnp.asarray(number, cells.weight.dtype) for number in (1.0, 0.0))
+    as_it_is = (Correction((one,) * 3, (zero,) * 3, one, one, zero),) * len(sums)
+    compared = in_strips(lambda sums: _correct_sums(sums, as_it_is), sums)
+    wide = _pool(cells, compared, levels=GAIN_LEVELS, size=size, scalars=scalars)
     gains = in_strips(partial(_gains, threshold=scalars.light_gain_threshold), *wide)
     narrow = _pool(cells, in_strips(_correct_sums, sums, gains), levels=OFFSET_LEVELS, size=size, scalars=scalars)
     return in_strips(partial(_offsets, threshold=scalars.light_offset_threshold), *narrow, gains)
@@ -293,7 +295,7 @@ def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, s
             offsets=_OFFSETS,
             per_tap=(distance[:, 0], distance[:, 1], jnp.asarray(np.log(kernel), away.dtype)),
             sums=jax.tree.map(lambda a: jnp.zeros((), a.dtype), state),
-            at_once=5,
+            at_once=5 if cells.weight.size >= MANY_CELLS else 1,
             step_size=step_size,
             largest_step=2 ** (levels - 1),
         ), None
