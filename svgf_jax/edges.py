@@ -81,11 +81,8 @@ def geometry_exponent(
     difference = jnp.abs(p.depth - q.depth)
     tolerance = sigma_depth * jnp.abs(depth_change) + depth_epsilon * p.depth
     tolerates = tolerance > 1e-12  # below, a quotient's derivative would overflow float32
-    z = jnp.where(
-        tolerates,
-        -difference / jnp.where(tolerates, tolerance, 1.0),
-        jnp.where(difference == 0.0, 0.0, NEVER),
-    )
+    divisor = jnp.where(tolerates, tolerance, 1.0)
+    z = jnp.where(tolerates, -difference, jnp.where(difference == 0.0, 0.0, NEVER))
     cosine = p.normal[0] * q.normal[0] + p.normal[1] * q.normal[1] + p.normal[2] * q.normal[2]
     faces = cosine > 1e-30  # log and its derivative stay finite
     n = jnp.where(
@@ -93,7 +90,7 @@ def geometry_exponent(
         sigma_normal * jnp.log(jnp.where(faces, cosine, 1.0)),
         jnp.where(jnp.asarray(sigma_normal) > 0.0, NEVER, 0.0),
     )
-    return z + n
+    return (z + n * divisor) / divisor  # the quotient last: XLA:CPU computes what leads to it once for all signals
 
 
 def luminance_scale(

@@ -23,11 +23,11 @@ Planes = Any  # a tree whose leaves are [H, W] arrays
 Sums = TypeVar("Sums")
 
 BY_WIDTH = 0  # rows per strip: as many as have STRIP_PIXELS pixels
-# The fastest of 4 to 64 thousand, at 480 and at 1920 pixels width: a strip's planes fit the level-2 cache.
-STRIP_PIXELS = 8192
+# Wall time of two cores, 480 to 1920 pixels width: half a strip of planes fits the level-2 cache of each.
+STRIP_PIXELS = 12288
 # How the mesh axis is called over which the rows are divided, and then the image's height.
 DIVIDED = "svgf_jax rows of "
-UNROLL_FROM = 2**19  # pixels of an image whose taps are unrolled: half the time, for some seconds more of compilation
+UNROLL_FROM = 2**16  # pixels of an image whose taps are unrolled: half the time, for two seconds more of compilation
 
 
 def planes(image: Array) -> tuple[Array, ...]:
@@ -154,7 +154,7 @@ def sum_over_taps(
     where: Array | None = None,
     step_size: int | Array = 1,
     largest_step: int = 1,
-    at_once: int = 1,
+    at_once: int | None = None,
     strip_rows: int | None = BY_WIDTH,
 ) -> Planes:
     """Run a stencil: for every pixel p, add up what `tap` makes of each neighbour q, then `finish` the sums.
@@ -173,7 +173,7 @@ def sum_over_taps(
         where: `[H, W]` bool; a strip without a True is not computed and its result is 0. None = everywhere.
         step_size: pixels per step, an integer; may be traced (a loop over levels then compiles once) unless strip_rows is None.
         largest_step: the largest value step_size may take.
-        at_once: taps per turn of the loop, where it isn't unrolled altogether: fewer turns for a longer compilation.
+        at_once: taps per turn of the loop: fewer turns for a longer compilation. None = all of a large picture, else one.
         strip_rows: rows per strip, `BY_WIDTH`; None = no strips and no loop, the plain form that the other is tested against.
 
     Returns:
@@ -191,7 +191,7 @@ def sum_over_taps(
 
     count, rows = split_rows(height, width, strip_rows)
     below = count * rows - height
-    unroll = len(offsets) if unroll_taps(height, width, len(offsets)) else at_once
+    unroll = at_once or (len(offsets) if unroll_taps(height, width, len(offsets)) else 1)
     padded = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), add_margin(neighbours, top, left))
     centred = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), (centre, where))
     corners = jnp.asarray(offsets) * jnp.asarray(step_size, jnp.int32) + jnp.array([[top, left]], jnp.int32)

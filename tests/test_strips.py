@@ -21,7 +21,7 @@ def test_strips_cover_the_image_with_few_rows_to_spare(height, width, strip_rows
         assert rows * width <= sampling.STRIP_PIXELS
 
 
-@pytest.mark.parametrize(("height", "width", "unrolled"), [(270, 480, False), (720, 1280, True), (1080, 1920, True)])
+@pytest.mark.parametrize(("height", "width", "unrolled"), [(136, 224, False), (270, 480, True), (1080, 1920, True)])
 def test_taps_are_unrolled_where_pictures_are_large(height, width, unrolled):
     assert sampling.unroll_taps(height, width, 25) == unrolled
     assert not sampling.unroll_taps(height, width, 49)  # 7 x 7: seldom asked for, long to compile
