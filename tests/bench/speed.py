@@ -31,6 +31,7 @@ import numpy as np
 
 import svgf_jax as sj
 from svgf_jax import accumulation, adaptation, atrous, color, modulation, reprojection, variance
+from svgf_jax.compiled import compiler_options
 from svgf_jax.edges import depth_gradient
 from svgf_jax.types import Config, Frame, Params
 
@@ -76,10 +77,14 @@ def take_turns(runs: dict, rounds: int) -> dict[str, tuple[float, float]]:
     return {name: tuple(np.median(spent[1:], axis=0).tolist()) for name, spent in times.items()}
 
 
+def as_runs_do() -> dict:
+    return compiler_options(jax.devices()[0].platform)
+
+
 def compiled(function, *args):
     """The function for these arguments, to be called without any, and what compiling it took of the processor."""
     began = processor()
-    program = jax.jit(function).lower(*args).compile()
+    program = jax.jit(function, compiler_options=as_runs_do()).lower(*args).compile()
     return (lambda: jax.block_until_ready(program(*args))), processor() - began
 
 
@@ -159,7 +164,7 @@ def steady(preset: str, height: int, width: int):
     go = lambda history, frame, leaves: sj.step(history, frame, params=leaves, config=config)  # noqa: E731
     history = sj.init(frame, config=config)
     began = processor()
-    program = jax.jit(go).lower(history, frame, leaves).compile()
+    program = jax.jit(go, compiler_options=as_runs_do()).lower(history, frame, leaves).compile()
     compile_s = processor() - began
     for _ in range(5):
         history, _ = program(history, frame, leaves)
