@@ -5,6 +5,8 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
+from svgf_jax.sampling import planes, stack_planes
+
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709, linear
 
 
@@ -36,8 +38,14 @@ def demodulate(radiance: Array, albedo: Array, *, albedo_floor: Array | float = 
     Returns:
         `[S, H, W, 3]`.
     """
-    illumination = radiance / jnp.maximum(albedo, albedo_floor)
-    return jnp.minimum(illumination, float(jnp.finfo(radiance.dtype).max) / 2**12)
+    largest = float(jnp.finfo(radiance.dtype).max) / 2**12
+    divisors = jnp.broadcast_to(jnp.maximum(albedo, albedo_floor), radiance.shape)
+    return stack_planes(  # the quotient last: XLA:CPU then computes a plane once, whoever reads it
+        tuple(
+            tuple(jnp.minimum(r, largest * d) / d for r, d in zip(planes(signal), planes(divisor), strict=True))
+            for signal, divisor in zip(radiance, divisors, strict=True)
+        )
+    )
 
 
 def remodulate(illumination: Array, albedo: Array, *, albedo_floor: Array | float = 1e-3) -> Array:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from svgf_jax.color import largest_luminance
-from svgf_jax.sampling import add_up
+from svgf_jax.sampling import add_up, planes
 from svgf_jax.types import Frame, Rejected
 
 _NOWHERE = 1e9  # a motion that points outside every image: no history
@@ -68,12 +68,17 @@ def _usable(depth: Array) -> Array:
 
 def _to_unit_length(normal: Array) -> tuple[Array, Array]:
     """Longer ones would weigh more than all else together: 1.1 ** 128 = 200000. A unit normal stays as it is, to the bit."""
-    largest = jnp.abs(normal).max(axis=-1)
+    x, y, z = planes(normal)
+    largest = jnp.maximum(jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.abs(z))
     some = largest > 1e-18
-    scaled = normal / jnp.where(some, largest, 1.0)[..., None]  # squares neither overflow nor vanish
-    square = jnp.where(some, (scaled * scaled).sum(axis=-1), 1.0)
+    divisor = jnp.where(some, largest, 1.0)
+    scaled = tuple(c / divisor for c in (x, y, z))  # squares neither overflow nor vanish
+    square = jnp.where(some, scaled[0] * scaled[0] + scaled[1] * scaled[1] + scaled[2] * scaled[2], 1.0)
     unusual = some & (jnp.abs(square * largest * largest - 1.0) > 0.02)
-    return jnp.where(unusual[..., None], scaled / jnp.sqrt(square)[..., None], normal), unusual
+    length = jnp.sqrt(square)
+    return jnp.stack(
+        [jnp.where(unusual, s / length, c) for s, c in zip(scaled, (x, y, z), strict=True)], axis=-1
+    ), unusual
 
 
 def _reflections(frame: Frame, surface: Array) -> dict[str, Array]:

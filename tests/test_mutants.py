@@ -99,7 +99,10 @@ MUTANTS = {
         "test_remodulate_undoes_demodulate",
     ),
     "floor added instead of applied": mutant(
-        "color", "radiance / jnp.maximum(albedo, albedo_floor)", "radiance / (albedo + albedo_floor)", "test_demodulate"
+        "color",
+        "broadcast_to(jnp.maximum(albedo, albedo_floor)",
+        "broadcast_to((albedo + albedo_floor)",
+        "test_demodulate",
     ),
     # Reprojection
     "no history in the first row and column": mutant(
