@@ -9,8 +9,8 @@ ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"atomic", "memory", "prints", "regular", "remedies", "spelling"},
     {"types"},
-    {"limits", "tonemapping", "toml", "npz"},
-    {"color", "sampling", "parameters", "metrics", "exr_layout", "threads", "check", "moments", "motion", "processes"},
+    {"limits", "tonemapping", "toml", "npz", "sampling"},
+    {"color", "parameters", "metrics", "exr_layout", "threads", "check", "moments", "motion", "processes"},
     {"windows", "noise", "exr_chunks"},
     {
         "methods",
