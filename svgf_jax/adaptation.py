@@ -43,7 +43,6 @@ from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
 
 GAIN_LEVELS = 3  # a-trous levels on the grid of cells: reach of +-14 cells
 OFFSET_LEVELS = 1  # +-2 cells
-MANY_CELLS = 2**16  # from here on a quicker loop is worth a longer compilation
 LARGEST_GAIN = 50.0
 _OFFSETS = square_offsets(2)
 _B3 = np.array([1, 4, 6, 4, 1]) / 16.0  # the B3 spline
@@ -295,7 +294,7 @@ def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, s
             offsets=_OFFSETS,
             per_tap=(distance[:, 0], distance[:, 1], jnp.asarray(np.log(kernel), away.dtype)),
             sums=jax.tree.map(lambda a: jnp.zeros((), a.dtype), state),
-            at_once=5 if cells.weight.size >= MANY_CELLS else 1,
+            at_once=5,
             step_size=step_size,
             largest_step=2 ** (levels - 1),
         ), None

@@ -173,7 +173,7 @@ def sum_over_taps(
         where: `[H, W]` bool; a strip without a True is not computed and its result is 0. None = everywhere.
         step_size: pixels per step, an integer; may be traced (a loop over levels then compiles once) unless strip_rows is None.
         largest_step: the largest value step_size may take.
-        at_once: taps per turn of the loop: fewer turns for a longer compilation. None = all of a large picture, else one.
+        at_once: taps per turn of the loop in a large picture (`unroll_taps`), None = all; in a small one it is one.
         strip_rows: rows per strip, `BY_WIDTH`; None = no strips and no loop, the plain form that the other is tested against.
 
     Returns:
@@ -191,7 +191,7 @@ def sum_over_taps(
 
     count, rows = split_rows(height, width, strip_rows)
     below = count * rows - height
-    unroll = at_once or (len(offsets) if unroll_taps(height, width, len(offsets)) else 1)
+    unroll = (at_once or len(offsets)) if unroll_taps(height, width, len(offsets)) else 1
     padded = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), add_margin(neighbours, top, left))
     centred = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), (centre, where))
     corners = jnp.asarray(offsets) * jnp.asarray(step_size, jnp.int32) + jnp.array([[top, left]], jnp.int32)
