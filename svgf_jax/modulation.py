@@ -29,7 +29,7 @@ def modulate(illumination: Array, frame: Frame, *, albedo_floor: Array | float =
             reflected = (remodulate(c, a, albedo_floor=albedo_floor) for c, a in zip(signal, albedo, strict=True))
             passed = (jnp.where(surface, r, own) for r, own in zip(reflected, radiance, strict=True))
             total = tuple(t + c for t, c in zip(total, passed, strict=True))
-        # A neighbour's light may be brighter than this albedo bears.
+        # Each is finite; two of the brightest are not, together.
         return tuple(jnp.minimum(t, float(jnp.finfo(t.dtype).max)) for t in total)
 
     image = in_strips(

@@ -8,6 +8,8 @@ from svgf_jax.sampling import add_up, planes
 from svgf_jax.types import Frame, Rejected
 
 _NOWHERE = 1e9  # a motion that points outside every image: no history
+_LARGEST_ALBEDO = 2.0**20
+"""Derivatives of what is spread to a pixel are multiplied by its albedo, and divided by the squares of others."""
 
 
 def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
@@ -15,9 +17,9 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
 
     Radiance: non-finite or negative components become 0. Emission: non-finite ones become 0, negative ones stay. A non-finite
     normal, depth, albedo or position, or a depth beyond 2e17 (in float32): no surface. A normal that is not of unit length by more
-    than 1 % is brought to it; one of zeros stays. A non-finite motion or prev_depth: no history. Guides read 0 where there is no
-    surface, the albedo 1. A measured variance that is not finite or negative becomes -1, unknown. A non-finite reflected motion or
-    depth: the reflection moves with the surface.
+    than 1 % is brought to it; one of zeros stays. A larger albedo than 2**20 counts as that, in dividing by it as in multiplying. A
+    non-finite motion or prev_depth: no history. Guides read 0 where there is no surface, the albedo 1. A measured variance that is
+    not finite or negative becomes -1, unknown. A non-finite reflected motion or depth: the reflection moves with the surface.
 
     Args:
         frame: one frame; shapes as in `Frame`.
@@ -39,7 +41,7 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
 
     repaired = Frame(
         radiance=jnp.where(radiance_finite & radiance_positive, frame.radiance, 0.0),
-        albedo=jnp.where(surface[None, :, :, None], frame.albedo, 1.0),
+        albedo=jnp.where(surface[None, :, :, None], jnp.minimum(frame.albedo, _LARGEST_ALBEDO), 1.0),
         emission=jnp.where(emission_finite, frame.emission, 0.0),
         normal=normal,
         depth=jnp.where(surface, frame.depth, 0.0),

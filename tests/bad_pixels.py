@@ -96,7 +96,7 @@ def sane_light(frames: Frame, albedo_floor: float) -> np.ndarray:
     """The largest sane illumination up to each frame, by signal: `[T, S]`."""
     with np.errstate(over="ignore", invalid="ignore"):
         radiance = np.where(np.isfinite(frames.radiance) & (frames.radiance >= 0), frames.radiance, 0)
-        albedo = np.where(np.isfinite(frames.albedo), frames.albedo, 1)
+        albedo = np.where(np.isfinite(frames.albedo), np.minimum(frames.albedo, 2**20), 1)
         light = np.minimum(radiance / np.maximum(albedo, np.float32(albedo_floor)), F32.max / 2**12)
     return np.maximum.accumulate(light.max(axis=(2, 3, 4)), axis=0)
 

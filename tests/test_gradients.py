@@ -191,6 +191,14 @@ def test_no_gradient_is_nan(dtype, dirty):
         assert np.abs(leaf).max() < 1e4, "no huge derivative of a root or a quotient either"
 
 
+def test_no_gradient_is_nan_beside_an_albedo_that_is_none():
+    """What is spread there would be multiplied by it, and its derivative divided by the square of an albedo nearby."""
+    frames = to_frames(sequence(ties=True), np.float32)
+    frames.albedo[:, :, 4, 5] = 3e38
+    for leaf in jax.tree.leaves(reverse(to_params(oracle.PAPER, np.float32), inputs_of(frames), frames)):
+        assert np.isfinite(leaf).all()
+
+
 def test_no_forward_gradient_is_nan():
     frames = to_frames(sequence(dirty=True, ties=True))
     paper = {k: np.full(LEVELS, oracle.PAPER[k]) for k in PARAMS}
