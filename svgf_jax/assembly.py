@@ -1,6 +1,7 @@
 """From planes by role to a frame: light, guides and the past, wherever the planes came from (files or arrays). NumPy only."""
 
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,8 +109,8 @@ def assemble(
     variance = np.stack(measured) if measured else None
     arrays: list[Any] = [radiance, albedo, emission, normal, depth, prev_depth, motion, object_id, variance]
     arrays.append(where if position else None)
-    pair = {"number": place.number, "previous": place.previous, "origin": place.origin}
-    arrays += signals_reflected(place.cameras, roles.signals, planes, depth, normal, object_id, **pair)
+    between = partial(signals_reflected, number=place.number, previous=place.previous, origin=place.origin)
+    arrays += between(place.cameras, roles.signals, planes, depth, normal, object_id)
     return Frame(*arrays), {reason: count for reason, count in counts.items() if count}, tuple(notes)
 
 

@@ -5,14 +5,14 @@ import errno
 import hashlib
 import os
 import uuid
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 _LONGEST = 128  # bytes, and 14 more around them
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike[str], *, unique: bool = True) -> Iterator[Path]:
+def replacing(path: str | os.PathLike[str], *, unique: bool = True) -> Generator[Path]:
     """An empty file in the folder of `path` to write into; it is flushed to the disk and renamed to `path` at the end.
 
     Its name is `.NAME.*.tmp` (of a long NAME only a part: `short`); whatever is raised inside removes it and leaves `path`

@@ -15,7 +15,7 @@ import json
 import math
 import os
 import socket
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TextIO
@@ -31,9 +31,8 @@ FOLDER = ".svgf-jax"
 FORMAT = 1  # of the files in FOLDER
 _MOST_TEXT = 2**28  # bytes; a million frames have less
 
-Identity = dict[
-    str, Any
-]  # JSON: whatever two runs must share to be the same run; its "frames" lists the inputs in order
+Identity = dict[str, Any]
+"""JSON: whatever two runs must share to be the same run; its "frames" lists the inputs in order."""
 
 
 class Busy(SvgfError):
@@ -53,7 +52,7 @@ def state_folder(out: Path, part: str = "") -> Path:
 
 
 @contextmanager
-def lock(state: Path) -> Iterator[Callable[[], None]]:
+def lock(state: Path) -> Generator[Callable[[], None]]:
     """Hold a state folder, creating it, so that no second run writes there; `SvgfError` if one does.
 
     Parts keep a run of the whole out, and it them, but not each other. The lock dies with its process, however that ends.
@@ -84,7 +83,7 @@ def holder(state: Path) -> str:
 
 
 @contextmanager
-def _held(state: Path, *, shared: bool = False) -> Iterator[Callable[[], None]]:
+def _held(state: Path, *, shared: bool = False) -> Generator[Callable[[], None]]:
     path = state / "lock"
     try:
         file = _locked(path, shared=shared)
@@ -120,9 +119,9 @@ def _locked(path: Path, *, shared: bool) -> TextIO:
         if not _try_lock(file, shared=shared):
             with file:
                 file.seek(0)
-                holder = file.read().strip() or "parts of the sequence"
+                other = file.read().strip() or "parts of the sequence"
             raise Busy(
-                f"Another run is writing into {_folder(path.parent)} ({holder}). "
+                f"Another run is writing into {_folder(path.parent)} ({other}). "
                 "Wait for it to end, or choose another output folder."
             )
         if _is(file, path):
@@ -179,7 +178,7 @@ def load_run(state: Path) -> tuple[Identity, bool] | None:
 def save_checkpoint(state: Path, identity: Identity, checkpoint: Checkpoint) -> None:
     """Replace the checkpoint. Only to be called when every output before `next_index` is on disk."""
     arrays = {} if checkpoint.history is None else _flat(checkpoint.history)
-    entries = {
+    entries: dict[str, Any] = {
         **{name: np.asarray(array) for name, array in arrays.items()},
         "format": np.asarray(FORMAT),
         "next_index": np.asarray(checkpoint.next_index),
@@ -248,7 +247,7 @@ def _check_arrays(history: History) -> None:
     real = history.illumination.dtype
     for name, array in _flat(history).items():
         wanted, shape = np.dtype(np.int32) if name == "object_id" else real, shapes.get(name, (height, width))
-        if real not in (np.float32, np.float64) or array.dtype != wanted or array.shape != shape:
+        if real.type not in (np.float32, np.float64) or array.dtype != wanted or array.shape != shape:
             raise ValueError(f"{name} is {array.dtype} {array.shape}")
         if not np.isfinite(array).all():
             raise ValueError(f"{name} is not finite")

@@ -1,6 +1,6 @@
 """The filter compiled for a device, with its parameters there. Imports JAX when first used, not before."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from functools import cache, partial
 from typing import Any, NamedTuple, TypeVar, cast
@@ -100,10 +100,11 @@ def _jitted(
     config: Config | MethodConfig,
     leave_out: tuple[str, ...],
     devices: tuple[Any, ...],
-) -> tuple[Callable, Any]:
+) -> tuple[Callable[..., Any], Any]:
     """Compiled once a process, however many sequences it denoises."""
     import jax
 
+    options = compiler_options(devices[0].platform)
     if len(devices) > 1:
         from svgf_jax.devices import step_over
 
@@ -116,7 +117,7 @@ def _jitted(
         history, output = step(history, frame, params=params, config=config)
         return history, output._replace(**dict.fromkeys(leave_out))
 
-    return jax.jit(start), jax.jit(go, donate_argnums=0, compiler_options=compiler_options(devices[0].platform))
+    return jax.jit(start), jax.jit(go, donate_argnums=0, compiler_options=options)
 
 
 @cache
@@ -181,7 +182,7 @@ def wait(result: Result, name: str) -> Result:
 
 
 @contextmanager
-def _enough_memory(name: str) -> Iterator[None]:
+def _enough_memory(name: str) -> Generator[None]:
     import jax
 
     try:

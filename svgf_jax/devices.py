@@ -74,7 +74,9 @@ def _mesh(height: int, devices: Sequence[Any]) -> tuple[Mesh, str]:
 
 
 @partial(jax.jit, static_argnames=("config", "devices"))
-def _step(history: History, frame: Frame, params: Params, *, config: Config, devices: tuple) -> tuple[History, Output]:
+def _step(
+    history: History, frame: Frame, params: Params, *, config: Config, devices: tuple[Any, ...]
+) -> tuple[History, Output]:
     height = frame.depth.shape[0]
     rows = rows_of_each(height, len(devices), config)
     mesh, axis = _mesh(height, devices)

@@ -11,7 +11,7 @@ Reading and writing may be called from several threads at once.
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from os import fspath
@@ -34,8 +34,10 @@ MOST_CHANNELS = 10_000
 """Of a file: the library's own time grows with their square, to a second for so many."""
 COMPRESSIONS = ("none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab")
 
-_STRUCTURAL = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name", "preview"}
-_STRUCTURAL |= {"maxSamplesPerPixel", "tiles", "type", "version", "zipCompressionLevel", "dwaCompressionLevel"}
+_STRUCTURAL = {
+    *("channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name", "preview"),
+    *("maxSamplesPerPixel", "tiles", "type", "version", "zipCompressionLevel", "dwaCompressionLevel"),
+}
 _PIXEL_TYPES = ("float16", "float32", "uint32")
 
 
@@ -187,7 +189,7 @@ def _text(version: tuple[int, ...]) -> str:
 
 
 @contextmanager
-def _opened(path: str, most: Limits | None) -> Iterator[tuple[BinaryIO, Layout]]:
+def _opened(path: str, most: Limits | None) -> Generator[tuple[BinaryIO, Layout]]:
     """A file that may be read, by its header, and its layout. Raises SvgfError."""
     try:
         if os.path.isdir(path):
@@ -321,5 +323,5 @@ def _fits(value: Any) -> bool:
     return isinstance(value, str) or type(value).__name__ in ("TimeCode", "KeyCode", "Envmap")
 
 
-def _window(value: list | tuple) -> bool:
+def _window(value: list[Any] | tuple[Any, ...]) -> bool:
     return len(value) == 2 and all(isinstance(corner, np.ndarray) and corner.shape == (2,) for corner in value)

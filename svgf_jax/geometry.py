@@ -1,6 +1,6 @@
 """What a frame's guides are, judged by themselves: the space of normals, the kind of depth, how long history will hold. No JAX."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -186,7 +186,7 @@ def expected_length(share: float, *, frames: int, most: float) -> float:
 
 
 def _consistent(
-    previous: Frame, current: Frame, here: tuple, x: np.ndarray, y: np.ndarray, params: Params
+    previous: Frame, current: Frame, here: tuple[Any, ...], x: np.ndarray, y: np.ndarray, params: Params
 ) -> np.ndarray:
     height, width = previous.object_id.shape
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)

@@ -36,8 +36,10 @@ def remove_outliers(
     if not config.outlier_radius:
         return illumination
     colors = tuple(map(planes, illumination))
-    options = {"radius": config.outlier_radius, "sigma": at_level(params, 0).outlier_sigma, "strip_rows": strip_rows}
-    return stack_planes(_clamp(colors, frame.object_id != -1, **options))
+    sigma = at_level(params, 0).outlier_sigma
+    return stack_planes(
+        _clamp(colors, frame.object_id != -1, radius=config.outlier_radius, sigma=sigma, strip_rows=strip_rows)
+    )
 
 
 def clamp_outliers(image: Array, *, radius: int = 3, sigma: Array | float = 10.0, mask: Array | None = None) -> Array:

@@ -215,7 +215,7 @@ def _number(name: str, value: Any, levels: int) -> Any:
     return _per_level(entries) if per_level else float(value)
 
 
-def _per_level(entries: list) -> Any:
+def _per_level(entries: list[float]) -> Any:
     import numpy as np
 
     return np.asarray(entries, dtype=np.float64)

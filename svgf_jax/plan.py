@@ -4,9 +4,9 @@ import contextlib
 import errno
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from svgf_jax import checkpoint
 from svgf_jax.atomic import check_names, short
@@ -100,7 +100,7 @@ def part_name(files: Files, warmup: int | None) -> str:
 
 
 @contextlib.contextmanager
-def locked(plan: Plan) -> Iterator[Callable[[], None]]:
+def locked(plan: Plan) -> Generator[Callable[[], None]]:
     """Hold the output folder, made if need be; gives what `checkpoint.lock` gives.
 
     Where the run fails before its first output, leave no trace of it: of the folders, those that it made. Where the folder was
@@ -214,7 +214,7 @@ def stamp(path: str | None) -> list[str | int] | None:
     return [Path(path).name, status.st_size, status.st_mtime_ns]
 
 
-def stamp_frame(plan: Plan, index: int) -> list:
+def stamp_frame(plan: Plan, index: int) -> list[Any]:
     """What tells that the inputs of one frame are still the same files: its number, and the stamp of each."""
     return [plan.files[index][0], *(stamp(files[index][1]) for files in (plan.files, *plan.others))]
 

@@ -4,7 +4,7 @@ import io
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
@@ -38,7 +38,7 @@ _watched: Any = _Watched()
 
 
 @contextmanager
-def kept() -> Iterator[list[str]]:
+def kept() -> Generator[list[str]]:
     """A list that receives what this thread would print inside; several threads may be inside at once."""
     global _watching
     with _lock:

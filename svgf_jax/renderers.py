@@ -172,8 +172,9 @@ def _signal(file: TomlFile, index: int, value: Any) -> Signal:
                 f"{place(file, 'light', index)}: [[light]] without {key!r}; wanted {', '.join(Signal._fields)}."
             )
     kinds = {"name": str, "channels": tuple, "albedo": tuple, "divided": bool}
-    given = {key: _of_type(file, kinds[key], one, "light", index, key) for key, one in value.items()}
-    return Signal(**({"albedo": (), "divided": False} | given))
+    given: dict[str, Any] = {"albedo": (), "divided": False}
+    given |= {key: _of_type(file, kinds[key], one, "light", index, key) for key, one in value.items()}
+    return Signal(**given)
 
 
 def _require_known(

@@ -8,6 +8,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -280,8 +281,8 @@ def _run_frames(run: Run, done: Sequence[tuple[int, int, Path]]) -> tuple[list[S
                 if run.source.sequence.files[index][1] is not None:
                     pictures = {"noisy": _noisy(frames.read_frame(run.source, index))} | pictures
                 maps = run.maps.get(number) or diagnostic_layers(image, longest=longest_history(run.params._asdict()))
-                look = {"exposure": run.options.exposure, "curve": run.options.tonemap}
-                shown.append(shown_frame(number, pictures, target, {"denoised": maps}, len(chosen), **look))
+                look = partial(shown_frame, exposure=run.options.exposure, curve=run.options.tonemap)
+                shown.append(look(number, pictures, target, {"denoised": maps}, len(chosen)))
             yield result, target
 
     return shown, list(metrics.score_frames(pairs(), with_ssim=False))

@@ -1,5 +1,7 @@
 """Temporal reprojection: fetch each pixel's history from where its surface point was (Schied et al. 2017, section 4.1)."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,7 +62,7 @@ def reproject(
         same = q_id == p["id"] if config.id_test else q_id != -1
         return inside & (p["id"] != -1) & same & near & (n[0] + n[1] + n[2] >= scalars.reproject_normal)
 
-    def mean_over(base_row: Array, base_column: Array, offsets: np.ndarray, weigh) -> tuple[Array, tuple]:
+    def mean_over(base_row: Array, base_column: Array, offsets: np.ndarray, weigh) -> tuple[Array, Any]:
         """Weights and weighted sums of the history's values over the taps base + offsets."""
         taps = jnp.asarray(offsets)
         weights = lax.map(lambda o: weigh(base_row + o[0], base_column + o[1], o), taps)

@@ -158,7 +158,7 @@ def _earlier(wanted: list[int], found: Iterable[int], count: int) -> list[int]:
     return numbers[first:]
 
 
-def _single(path: str, number: re.Match | None, wanted: list[int] | None, missing: Missing) -> Sequence:
+def _single(path: str, number: re.Match[str] | None, wanted: list[int] | None, missing: Missing) -> Sequence:
     if wanted is not None and len(wanted) != 1:
         raise SvgfError(
             f"{path}: one file without a frame number, but {len(wanted)} frames are asked for; try a pattern."

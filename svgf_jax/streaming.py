@@ -164,8 +164,7 @@ def run(
 
     def filters() -> Filters:
         leave_out = _NEVER_READ if options.diagnostics or on_output else _NEVER_READ + _DIAGNOSTICS
-        options_of = {"device": device, "devices": devices, "pipeline": pipeline, "leave_out": leave_out}
-        made = compile_filters(params, config, **options_of)
+        made = compile_filters(params, config, device=device, devices=devices, pipeline=pipeline, leave_out=leave_out)
         device_name.append(made.device)
         return made
 

@@ -3,7 +3,7 @@
 import contextlib
 import importlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 
 import numpy as np
 
@@ -16,7 +16,7 @@ ADDRESS = "localhost:14158"  # where tev listens if nothing else is said
 @contextlib.contextmanager
 def tev(
     address: str = ADDRESS, *, tell: Callable[[str], None] = lambda text: None
-) -> Iterator[Callable[[LoadedFrame, Output], None]]:
+) -> Generator[Callable[[LoadedFrame, Output], None]]:
     """What `streaming.run(on_output=...)` takes: it sends each frame to tev as one image `svgf-jax frame N`.
 
     The image has the layers R G B (denoised), noisy, variance, history_length and valid. A viewer that goes away while the

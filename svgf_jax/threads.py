@@ -1,7 +1,7 @@
 """Reading ahead and writing behind: two small bounded queues over thread pools, or over one that they share."""
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import Any, Protocol, TypeVar
@@ -39,7 +39,7 @@ class Submit(Protocol):
 
 
 @contextmanager
-def write_behind(done: Callable[[Any], None], *, threads: int, pool: Executor | None = None) -> Iterator[Submit]:
+def write_behind(done: Callable[[Any], None], *, threads: int, pool: Executor | None = None) -> Generator[Submit]:
     """A function that runs jobs in the background, and waits while more than `threads` of them are unfinished.
 
     Results reach `done` in the order of submission, in the caller's thread. A job's exception is raised by a later

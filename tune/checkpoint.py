@@ -28,7 +28,7 @@ def save(path: Path, progress: Progress, identity: dict[str, Any]) -> None:
         "states": len(state),
         "found": progress.found is not None,
     }
-    content = {
+    content: dict[str, Any] = {
         "header": np.array(json.dumps(header)),
         "trials": np.array([[i.start, i.number, i.loss, i.accepted, i.damping] for i in rows]).reshape(len(rows), 5),
         "values": np.array([i.values for i in rows]),

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Repeated: Parameter = Parameter(negative=(), consume_multiple=True, show_default=False)
 SECOND = ("alt", "second", "noisy2")  # what the second render is called in a folder
 MAPS = "sensitivity.exr"  # as `explore.write_maps` calls it
+Names = tuple[str, ...]
 WHAT, HOW, OUTPUT = (Group(name, sort_key=i) for i, name in enumerate(["What", "How", "Output"], 1))
 
 
@@ -246,7 +247,7 @@ def command(
 
 
 def _check(
-    noisy: tuple, reference: tuple, second: tuple, validate: tuple, validate_reference: tuple, robust: str
+    noisy: Names, reference: Names, second: Names, validate: Names, validate_reference: Names, robust: str
 ) -> None:
     if not noisy:
         raise SvgfError(
@@ -285,7 +286,7 @@ def _check_numbers(
             raise SvgfError(f"Got {option} {count}; wanted at least 1.")
 
 
-def _check_apart(noisy: tuple, frames: str | None, validate: tuple, validate_frames: str | None, second: tuple) -> None:
+def _check_apart(noisy: Names, frames: str | None, validate: Names, validate_frames: str | None, second: Names) -> None:
     """What is validated on must not be tuned on, and a second render must not be the first: judged by the files."""
     tuned = set().union(*(_files(name, frames) for name in noisy)) if validate or second else set()
     for name in validate:
@@ -315,7 +316,7 @@ def _interrupted(found: "Fit") -> bool:
 
 
 @contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
+def _terminated_as_interrupted() -> Generator[None]:
     """SIGTERM ends a fit as Ctrl-C does: with the best so far."""
 
     def on_signal(number: int, _: object) -> None:

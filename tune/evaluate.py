@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -50,5 +50,5 @@ def worse(before: Measured, after: Measured, *, tolerance: float = 0.0) -> str |
 
 
 @cache
-def _step(config: Config) -> Callable:
+def _step(config: Config) -> Callable[..., Any]:
     return jax.jit(partial(step, config=config))

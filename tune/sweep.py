@@ -119,7 +119,7 @@ def sweep(problem: Problem, y: np.ndarray, *, linear: bool, bound: float = np.in
         for i, shot in enumerate(problem.shots):
             if problem.share is not None and i % problem.share.size != problem.share.rank:
                 continue
-            before: Future | None = None
+            before: Future[Any] | None = None
             with closing(frame_blocks(problem, i, shot, y, linear)) as blocks:
                 for block in blocks:
                     if before is not None:
@@ -164,7 +164,7 @@ def _reduce(block: tuple[jax.Array, list[jax.Array]]) -> tuple[float, np.ndarray
     return loss, combine(factors), gradients.T @ gradients
 
 
-def _take(future: Future, triangle: np.ndarray, scatter: np.ndarray) -> float:
+def _take(future: Future[Any], triangle: np.ndarray, scatter: np.ndarray) -> float:
     """Add a reduced frame to the running sums, in order, so that a repeated run gives the same bits."""
     loss, factor, outer = future.result()
     if factor is not None:

@@ -3,7 +3,7 @@
 import importlib.metadata
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -41,7 +41,7 @@ class Comparison(NamedTuple):
 
 
 @contextmanager
-def live(shots: int, frames: int, labels: Sequence[str]) -> Iterator[Callable[[Iteration], None]]:
+def live(shots: int, frames: int, labels: Sequence[str]) -> Generator[Callable[[Iteration], None]]:
     """A function to call with each trial point of `labels`: a growing table on a terminal, a line each elsewhere."""
     terminal.tell(
         f"tuning on {shots} {'sequence' if shots == 1 else 'sequences'}, {frames} frames; the first trial compiles"
@@ -52,7 +52,7 @@ def live(shots: int, frames: int, labels: Sequence[str]) -> Iterator[Callable[[I
 
 
 @contextmanager
-def _lines(began: float, labels: Sequence[str]) -> Iterator[Callable[[Iteration], None]]:
+def _lines(began: float, labels: Sequence[str]) -> Generator[Callable[[Iteration], None]]:
     def on_iteration(iteration: Iteration) -> None:
         number, loss, *rest = _cells(iteration, began)
         terminal.tell("  ".join((number, f"loss {loss}", *rest)))
@@ -62,7 +62,7 @@ def _lines(began: float, labels: Sequence[str]) -> Iterator[Callable[[Iteration]
 
 
 @contextmanager
-def _table(began: float, labels: Sequence[str]) -> Iterator[Callable[[Iteration], None]]:
+def _table(began: float, labels: Sequence[str]) -> Generator[Callable[[Iteration], None]]:
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.live import Live

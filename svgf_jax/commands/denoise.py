@@ -3,7 +3,7 @@
 import shlex
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -260,7 +260,7 @@ def _conclude(summary: "Summary", *, verbose: bool) -> None:
 
 
 @contextmanager
-def _until_interrupted() -> Iterator[list[int]]:
+def _until_interrupted() -> Generator[list[int]]:
     """A list that receives the number of a SIGINT, SIGTERM or SIGHUP; a second SIGINT interrupts at once."""
     received: list[int] = []
 

@@ -11,7 +11,7 @@ set = { alpha = 0.4 }
 
 import os
 import types
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Generator, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -66,7 +66,7 @@ def use_project(app: App, given: str, *, commands: App, table: str | None = None
 
 
 @contextmanager
-def located(app: App) -> Iterator[None]:
+def located(app: App) -> Generator[None]:
     """What is wrong with a value of the project file is told with its line: in errors that quote it."""
     try:
         yield

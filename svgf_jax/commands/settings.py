@@ -1,6 +1,6 @@
 """Options that set numbers and names: `--preset`, `--params`, `--set NAME=VALUE`, `--channel ROLE=...`. No JAX."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,7 +77,7 @@ class Largest:
     max_ratio: Annotated[int, Parameter(metavar="TIMES", group=PROJECT)] = limits.MAX_RATIO
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def held(self) -> Generator[None]:
         """Let them hold meanwhile."""
         limits.set_limits(self.max_pixels, self.max_ratio)
         try:
@@ -143,7 +143,9 @@ def _split(text: str, *, option: str, example: str) -> tuple[str, str]:
     return key, value
 
 
-def _value(key: str, text: str, choices: Mapping[str, range | tuple] = CHOICES, *, per_level: bool = True) -> Any:
+def _value(
+    key: str, text: str, choices: Mapping[str, range | tuple[Any, ...]] = CHOICES, *, per_level: bool = True
+) -> Any:
     """A number, or a comma list of one per a-trous level; for a choice one of its values."""
     if key in choices:
         named = {str(value).lower(): value for value in choices[key]}

@@ -6,7 +6,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -140,7 +140,7 @@ def to_json(value: Any) -> str:
 
 
 @contextmanager
-def progress(total: int) -> Iterator[Callable[["FrameReport"], None]]:
+def progress(total: int) -> Generator[Callable[["FrameReport"], None]]:
     """A function to call with each frame's report: a bar with frames/s and time left; off a terminal a line a frame."""
     with bar(total) as advance:
 
@@ -154,7 +154,7 @@ def progress(total: int) -> Iterator[Callable[["FrameReport"], None]]:
 
 
 @contextmanager
-def bar(total: int) -> Iterator[Callable[[str], None]]:
+def bar(total: int) -> Generator[Callable[[str], None]]:
     """A function to call after each of so many frames, with its name; it moves a bar, or does nothing off a terminal."""
     if not sys.stderr.isatty():
         yield lambda name: None
