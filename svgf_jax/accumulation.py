@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from svgf_jax.color import largest_luminance, luminance_of_planes
+from svgf_jax.color import luminance_of_moments, luminance_of_planes
 from svgf_jax.sampling import BY_WIDTH, in_strips, planes, stack_planes
 from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
 from svgf_jax.windows import window_range
@@ -53,7 +53,7 @@ def accumulate(
             previous_colors, previous_moments = _shortened(
                 previous_colors, previous_moments, colors, longest, (weight, weight_moments)
             )
-        lumas = [jnp.minimum(luminance_of_planes(*color), largest_luminance(length.dtype)) for color in colors]
+        lumas = [luminance_of_moments(color) for color in colors]
         moments = [(luma, luma * luma) for luma in lumas]
         blended_moments = jax.tree.map(
             lambda old, new: _blend(old, new, weight_moments), previous_moments, tuple(moments)
@@ -127,7 +127,7 @@ def _shortened(previous_colors, previous_moments, colors, longest, weights: tupl
     out_colors, out_moments = [], []
     for old, pair, color, frames in zip(previous_colors, previous_moments, colors, longest, strict=True):
         share, share_moments = (jnp.maximum(1.0 / frames - a, 0.0) / jnp.maximum(1.0 - a, 1e-6) for a in weights)
-        luma = jnp.minimum(luminance_of_planes(*color), largest_luminance(frames.dtype))
+        luma = luminance_of_moments(color)
         out_colors.append(tuple(_blend(o, c, share) for o, c in zip(old, color, strict=True)))
         out_moments.append((_blend(pair[0], luma, share_moments), _blend(pair[1], luma * luma, share_moments)))
     return tuple(out_colors), tuple(out_moments)

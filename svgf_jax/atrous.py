@@ -170,7 +170,7 @@ def _filter_planes(
 def _add_tap(total, weight: Array, color: tuple[Array, ...], variance: Array):
     weights, colors, variances = total
     colors = tuple(c + weight * q for c, q in zip(colors, color, strict=True))
-    return weights + weight, colors, variances + weight * weight * variance
+    return weights + weight, colors, variances + weight * (weight * variance)  # in this order derivatives stay finite
 
 
 def _normalise(total, color: tuple[Array, ...], variance: Array):

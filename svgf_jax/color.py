@@ -25,6 +25,11 @@ def largest_luminance(dtype: Any) -> float:
     return float(jnp.finfo(dtype).max) ** 0.5 / 2**6
 
 
+def luminance_of_moments(color: tuple[Array, ...]) -> Array:
+    """Luminance as the moments take it, limited: its square times the derivatives of what becomes of it stays finite."""
+    return jnp.minimum(luminance_of_planes(*color), largest_luminance(color[0].dtype) / 2**14)
+
+
 def demodulate(radiance: Array, albedo: Array, *, albedo_floor: Array | float = 1e-3) -> Array:
     """Illumination: radiance / max(albedo, albedo_floor), per signal and channel.
 

@@ -22,3 +22,5 @@ def test_luminance_has_a_square_that_can_be_summed(dtype, most):
     assert color.largest_luminance(dtype) == pytest.approx(most, rel=1e-6)
     assert np.isfinite(np.full(4095, most, dtype) ** 2).all()
     assert np.isfinite((np.full(4095, most, dtype) ** 2).sum(dtype=dtype))
+    brightest = color.luminance_of_moments((np.full((1, 1), most * 2, dtype),) * 3)
+    np.testing.assert_allclose(brightest, most / 2**14, rtol=1e-6)

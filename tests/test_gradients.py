@@ -8,6 +8,7 @@ import pytest
 import scenes
 from bridge import to_config, to_frames, to_params
 
+from svgf_jax.atrous import _add_tap
 from svgf_jax.pipeline import denoise
 from svgf_jax.types import Params
 
@@ -197,6 +198,16 @@ def test_no_gradient_is_nan_beside_an_albedo_that_is_none():
     frames.albedo[:, :, 4, 5] = 3e38
     for leaf in jax.tree.leaves(reverse(to_params(oracle.PAPER, np.float32), inputs_of(frames), frames)):
         assert np.isfinite(leaf).all()
+
+
+def test_the_derivative_of_what_an_edge_lets_through_of_a_large_variance_is_finite():
+    """Of the deviation w sqrt(V), where that of w^2 V times V is beyond float32."""
+
+    def deviation(weight):
+        _, _, variance = _add_tap((0.0, (0.0,) * 3, 0.0), weight, (1.0,) * 3, 1e26)
+        return 1e10 * jnp.sqrt(variance)
+
+    np.testing.assert_allclose(jax.grad(deviation)(jnp.float32(1e-18)), 1e23, rtol=1e-5)
 
 
 def test_no_forward_gradient_is_nan():

@@ -86,8 +86,8 @@ MUTANTS = {
     ),
     "moments of the accumulated light": mutant(
         "accumulation",
-        "luminance_of_planes(*color), largest_luminance(length.dtype)) for color in colors]",
-        "luminance_of_planes(*(_blend(o, c, weight) for o, c in zip(old, color))), 1e30)"
+        "[luminance_of_moments(color) for color in colors]",
+        "[luminance_of_moments(tuple(_blend(o, c, weight) for o, c in zip(old, color)))"
         " for old, color in zip(previous_colors, colors)]",
         "test_accumulate",
     ),
@@ -199,7 +199,7 @@ MUTANTS = {
         "atrous",
         (
             ("sums=tuple((zero, (zero, zero, zero), zero) for", "sums=tuple((zero, (zero, zero, zero), (zero, zero)) for"),
-            ("variances + weight * weight * variance", "(variances[0] + weight**2 * variance, variances[1] + weight**2)"),
+            ("variances + weight * (weight * variance)", "(variances[0] + weight**2 * variance, variances[1] + weight**2)"),
             ("variances / divisor / divisor", "variances[0] / jnp.maximum(variances[1], 1e-30)"),
         ),
         "test_atrous_level",
@@ -208,7 +208,7 @@ MUTANTS = {
     "variance filtered like the light": Mutant(
         "atrous",
         (
-            ("variances + weight * weight * variance", "variances + weight * variance"),
+            ("variances + weight * (weight * variance)", "variances + weight * variance"),
             ("variances / divisor / divisor", "variances / divisor"),
         ),
         "test_atrous_level",
