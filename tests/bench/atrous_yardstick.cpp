@@ -1,5 +1,5 @@
 // The a-trous stage of svgf_jax by hand: GCC vector extensions, OpenMP over rows, sums in registers. A yardstick, not a product:
-// what a careful programmer gets out of the same machine for the same arithmetic. See atrous_yardstick.py.
+// what a careful programmer gets out of the same machine for the same arithmetic. See speed.py.
 #include <cstdint>
 #include <cstring>
 #include <vector>
@@ -156,4 +156,21 @@ extern "C" void atrous(int signals, int h, int w, int levels, int feedback, cons
                        float *fed_back) {
     (signals == 1 ? filter<1> : filter<2>)(h, w, levels, feedback, sigma, colors, variances, depth, normal, ids, slope_x, slope_y,
                                            fed_back);
+}
+
+// As many multiply-adds as the machine can do: sixteen independent sums a core, all in registers. Returns how many were done.
+extern "C" double multiply_adds(long turns) {
+    double done = 0, kept = 0;
+#pragma omp parallel reduction(+ : done, kept)
+    {
+        Lanes sums[16] = {};
+        Lanes factor = Lanes{} + 0.999f;
+        for (long i = 0; i < turns; i++) {
+            asm volatile("" : "+v"(factor)); // not to be worked out beforehand
+            for (Lanes &sum : sums) sum = sum * factor + factor;
+        }
+        for (Lanes &sum : sums) kept += sum[0];
+        done = 16.0 * WIDTH * turns;
+    }
+    return kept < 0 ? kept : done;
 }

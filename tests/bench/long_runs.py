@@ -3,7 +3,8 @@
     python tests/bench/long_runs.py [memory] [overlap] [start] [endless] [drift] [same] [restarts] [--rounds 3] [--minutes 60]
 
 memory: peak resident set at 1920x1080 and 3840x2160 with two signals, for ten frames and (at 1920x1080) for --long of them.
-overlap: wall time of a run at 1920x1080, ZIP, beside the larger of reading and writing alone, and filtering alone.
+overlap: wall time of a run at 1920x1080, ZIP, beside the larger of reading and writing alone, and filtering alone; and what share
+of the cores it keeps busy.
 start: seconds from the command to the first written frame at 480x270.
 endless: resident memory, open files and threads over --endless frames of 240x135 (1.6 GB of disk; Linux).
 drift: float32 against float64 over --endless frames on arrays: the variance from the accumulated moments, by how much larger
@@ -51,15 +52,15 @@ def write_sequence(folder: Path, height: int, width: int, frames: int) -> None:
         exr.write(path, exr.new_image({name: np.ascontiguousarray(plane) for name, plane in channels.items()}))
 
 
-def denoise(folder: Path, out: Path, *options: str) -> tuple[float, float]:
-    """(seconds, peak resident set in GB) of a run in a process of its own."""
+def denoise(folder: Path, out: Path, *options: str) -> tuple[float, float, float]:
+    """(seconds, peak resident set in GB, seconds of all cores) of a run in a process of its own."""
     command = [sys.executable, "-m", "svgf_jax", "denoise", str(folder), "-o", str(out), *options]
     began = time.monotonic()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"{' '.join(command)} failed")
-    return time.monotonic() - began, used.ru_maxrss * 1024 / 1e9
+    return time.monotonic() - began, used.ru_maxrss * 1024 / 1e9, used.ru_utime + used.ru_stime
 
 
 def bench_memory(folder: Path, options: argparse.Namespace) -> list[str]:
@@ -67,7 +68,7 @@ def bench_memory(folder: Path, options: argparse.Namespace) -> list[str]:
     for height, width, frames in ((1080, 1920, 10), (1080, 1920, options.long), (2160, 3840, 10)):
         shot = folder / f"{width}-{frames}"
         write_sequence(shot, height, width, frames)
-        _, peak = denoise(shot, folder / f"clean-{width}-{frames}")
+        _, peak, _ = denoise(shot, folder / f"clean-{width}-{frames}")
         lines.append(f"| {width}x{height} | {frames} | {peak:.2f} |")
     return lines
 
@@ -82,11 +83,12 @@ def bench_overlap(folder: Path, options: argparse.Namespace) -> list[str]:
     write_sequence(shot, 1080, 1920, frames)
     source = sj.open_source(shot)
     params, config = sj.preset("paper")
-    spent = {"reading and writing": [], "filtering": [], "run": []}
+    spent, busy = {"reading and writing": [], "filtering": [], "run": []}, []
     for i in range(options.rounds):
-        one, _ = denoise(shot, folder / f"one-{i}", "--frames", "0-1")
-        whole, _ = denoise(shot, folder / f"all-{i}")
+        one, _, one_used = denoise(shot, folder / f"one-{i}", "--frames", "0-1")
+        whole, _, whole_used = denoise(shot, folder / f"all-{i}")
         spent["run"].append((whole - one) / (frames - 2))
+        busy.append((whole_used - one_used) / (whole - one) / len(os.sched_getaffinity(0)))
         began = time.monotonic()
         loaded = [sj.read_frame(source, k) for k in range(3)]
         image = exr.read(folder / f"one-{i}" / "frame_00000.exr")
@@ -105,6 +107,8 @@ def bench_overlap(folder: Path, options: argparse.Namespace) -> list[str]:
         "| a frame of 1920x1080 | / the larger part |",
         "|---|---|",
         *(f"| {name} | {seconds / larger:.2f} |" for name, seconds in median.items()),
+        "",
+        f"Of the cores, the run keeps {np.median(busy):.0%} busy.",
     ]
 
 

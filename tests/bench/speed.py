@@ -4,7 +4,8 @@
 
 atrous: the a-trous stage beside the same arithmetic by hand (atrous_yardstick.cpp; needs g++), whose result it must equal.
 step: a whole frame, with presets `paper` and `adaptive`, beside Intel Open Image Denoise's fast mode for one image (needs pyoidn).
-stages: each stage by itself: time, bytes that must be moved at least, and how near that comes to the measured copy bandwidth.
+stages: each stage by itself: time, bytes that must be moved at least, operations, and how near these come to the copies and (with
+g++) the multiply-adds that the machine is measured to do; an exponential, logarithm, power or root counts as 20 operations.
 sizes: a whole frame per pixel, from 480x270 to 3840x2160, and the seconds until the first frame is there.
 
 Without names all of them. Times are medians; "processor" counts the seconds of all cores, which other work on the machine disturbs
@@ -28,6 +29,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import jaxprs_in_params
 
 import svgf_jax as sj
 from svgf_jax import accumulation, adaptation, atrous, color, modulation, reprojection, variance
@@ -92,12 +94,50 @@ def numbers(params: Params) -> Params:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)
 
 
-def yardstick(folder: str, light, spread, frame: Frame, params: Params, config: Config):
-    """A function that filters by hand and returns (seconds, seconds of the processor, results); None without g++."""
+def by_hand() -> ctypes.CDLL | None:
+    """The C++, compiled; None without g++."""
     if shutil.which(BUILD[0]) is None:
         return None
-    subprocess.run([*BUILD, str(SOURCE), "-o", f"{folder}/yardstick.so"], check=True)
-    library = ctypes.CDLL(f"{folder}/yardstick.so")
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run([*BUILD, str(SOURCE), "-o", f"{folder}/yardstick.so"], check=True)
+        return ctypes.CDLL(f"{folder}/yardstick.so")
+
+
+def most_operations() -> float | None:
+    """Operations a second, two for each multiply-add, on all cores; None without g++."""
+    library = by_hand()
+    if library is None:
+        return None
+    library.multiply_adds.restype, library.multiply_adds.argtypes = ctypes.c_double, [ctypes.c_long]
+    seconds, turns = [], 10_000_000
+    for _ in range(6):
+        began = time.monotonic()
+        done = library.multiply_adds(turns)
+        seconds.append(time.monotonic() - began)
+    return 2 * done / float(np.median(seconds[1:]))
+
+
+COSTS = {"add": 1, "sub": 1, "mul": 1, "div": 1, "max": 1, "min": 1, "abs": 1, "neg": 1, "floor": 1, "integer_pow": 1}
+COSTS |= {"select_n": 1, "clamp": 1, "lt": 1, "le": 1, "gt": 1, "ge": 1, "eq": 1, "ne": 1, "and": 1, "or": 1}
+COSTS |= dict.fromkeys(("exp", "log", "log1p", "pow", "sqrt", "rsqrt", "cbrt"), 20)
+
+
+def operations(jaxpr, of_branches) -> int:
+    """Of a jaxpr, loops and all; `of_branches` chooses among those of a `lax.cond` (min, max)."""
+    total = 0
+    for equation in jaxpr.eqns:
+        inner = [operations(one, of_branches) for one in jaxprs_in_params(equation.params)]
+        if equation.primitive.name == "cond":
+            total += of_branches(inner)
+        elif inner:
+            total += equation.params.get("length", 1) * sum(inner)
+        else:
+            total += COSTS.get(equation.primitive.name, 0) * equation.outvars[0].aval.size
+    return total
+
+
+def yardstick(library: ctypes.CDLL, light, spread, frame: Frame, params: Params, config: Config):
+    """A function that filters by hand and returns (seconds, seconds of the processor, results)."""
     slopes = depth_gradient(frame.depth, frame.object_id)
     names = [
         "sigma_luminance",
@@ -129,31 +169,31 @@ def bench_atrous(height: int, width: int, rounds: int) -> list[str]:
         "| a-trous, five levels | library / by hand, wall | processor | largest difference | compile, s |",
         "|---|---|---|---|---|",
     ]
-    with tempfile.TemporaryDirectory() as folder:
-        for signals in (1, 2):
-            frame = some_frame(height, width, signals)
-            spread = 0.1 * frame.radiance[..., 0]
-            by_hand = yardstick(folder, frame.radiance, spread, frame, params, config)
-            if by_hand is None:
-                return ["No g++ here: nothing to compare the a-trous stage with."]
-            library, compile_s = compiled(
-                lambda *a: atrous.atrous_filter(*a[:3], params=a[3], config=config),
-                *(frame.radiance, spread, frame, numbers(params)),
-            )
-            # The two agree but where a threshold (no weight at all) falls between their roundings: a pixel in ten thousand.
-            off = [np.abs(np.asarray(a) - b).ravel() for a, b in zip(library(), by_hand()[2], strict=True)]
-            worst = max(float(np.quantile(error, 0.9999)) for error in off)
-            if worst > 1e-4:
-                raise SystemExit(f"The yardstick computes something else: {worst}")
-            spent = {"library": [], "by hand": []}
-            for _ in range(rounds):
-                spent["by hand"].append(by_hand()[:2])
-                wall, used = time.monotonic(), processor()
-                library()
-                spent["library"].append((time.monotonic() - wall, processor() - used))
-            wall, used = np.median(spent["library"], axis=0) / np.median(spent["by hand"], axis=0)
-            size = f"{width}x{height}, {signals} signal{'s' * (signals > 1)}"
-            lines.append(f"| {size} | {wall:.2f} | {used:.2f} | {worst:.0e} | {compile_s:.1f} |")
+    made = by_hand()
+    if made is None:
+        return ["No g++ here: nothing to compare the a-trous stage with."]
+    for signals in (1, 2):
+        frame = some_frame(height, width, signals)
+        spread = 0.1 * frame.radiance[..., 0]
+        filter_by_hand = yardstick(made, frame.radiance, spread, frame, params, config)
+        library, compile_s = compiled(
+            lambda *a: atrous.atrous_filter(*a[:3], params=a[3], config=config),
+            *(frame.radiance, spread, frame, numbers(params)),
+        )
+        # The two agree but where a threshold (no weight at all) falls between their roundings: a pixel in ten thousand.
+        off = [np.abs(np.asarray(a) - b).ravel() for a, b in zip(library(), filter_by_hand()[2], strict=True)]
+        worst = max(float(np.quantile(error, 0.9999)) for error in off)
+        if worst > 1e-4:
+            raise SystemExit(f"The yardstick computes something else: {worst}")
+        spent = {"library": [], "by hand": []}
+        for _ in range(rounds):
+            spent["by hand"].append(filter_by_hand()[:2])
+            wall, used = time.monotonic(), processor()
+            library()
+            spent["library"].append((time.monotonic() - wall, processor() - used))
+        wall, used = np.median(spent["library"], axis=0) / np.median(spent["by hand"], axis=0)
+        size = f"{width}x{height}, {signals} signal{'s' * (signals > 1)}"
+        lines.append(f"| {size} | {wall:.2f} | {used:.2f} | {worst:.0e} | {compile_s:.1f} |")
     return lines
 
 
@@ -268,8 +308,9 @@ def bench_stages(height: int, width: int, rounds: int) -> list[str]:
             (now.illumination, frame),
         ),
     }
-    runs, least = {}, {}
+    runs, least, work = {}, {}, {}
     for name, (function, args) in stages.items():
+        work[name] = operations(jax.make_jaxpr(function)(*args).jaxpr, max if "7 x 7" in name else min)
         runs[name], _ = compiled(function, *args)
         size = lambda tree: sum(leaf.nbytes for leaf in jax.tree.leaves(tree))  # noqa: E731
         least[name] = size(args) + size(runs[name]())
@@ -279,13 +320,27 @@ def bench_stages(height: int, width: int, rounds: int) -> list[str]:
     whole = sum(
         wall for name, (wall, _) in spent.items() if name in stages and "follow" not in name and "7 x 7" not in name
     )
-    bandwidth = 2 * big.nbytes / spent.pop("copy")[0]
-    lines = ["| stage | share of a step | processor, s | least MB moved | of copy bandwidth |", "|---|---|---|---|---|"]
+    bandwidth, peak = 2 * big.nbytes / spent.pop("copy")[0], most_operations()
+    titles = (
+        "stage",
+        "share of a step",
+        "processor, s",
+        "least MB moved",
+        "of copy bandwidth",
+        "10^9 operations",
+        "of their peak",
+    )
+    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     for name, (wall, used) in spent.items():
-        lines.append(
-            f"| {name} | {wall / whole:.0%} | {used:.2f} | {least[name] / 1e6:.0f} | {least[name] / wall / bandwidth:.0%} |"
+        moved, done = (
+            f"{least[name] / wall / bandwidth:.0%}",
+            "?" if peak is None else f"{work[name] / wall / peak:.0%}",
         )
-    return [*lines, "", f"Copy bandwidth: {bandwidth / 1e9:.1f} GB/s."]
+        lines.append(
+            f"| {name} | {wall / whole:.0%} | {used:.2f} | {least[name] / 1e6:.0f} | {moved} | {work[name] / 1e9:.2f} | {done} |"
+        )
+    known = "" if peak is None else f" Multiply-adds: {peak / 1e9:.0f} billion operations a second."
+    return [*lines, "", f"Copy bandwidth: {bandwidth / 1e9:.1f} GB/s.{known}"]
 
 
 def bench_sizes(height: int, width: int, rounds: int) -> list[str]:
