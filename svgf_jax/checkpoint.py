@@ -164,8 +164,8 @@ def load_run(state: Path) -> tuple[Identity, bool] | None:
     path = state / "run.json"
     try:
         record = json.loads(_text(path))
-        if record["format"] != FORMAT:
-            raise ValueError(f"format {record['format']!r}, wanted {FORMAT}")
+        if not isinstance(record, dict) or record["format"] != FORMAT:
+            raise ValueError(f"wanted a record of format {FORMAT}")
         if not isinstance(record["identity"]["frames"], list) or not isinstance(record["complete"], bool):
             raise ValueError("incomplete")
         return record["identity"], record["complete"]
@@ -356,8 +356,9 @@ def _differences(saved: Any, now: Any, name: str = "") -> Iterator[tuple[str, An
 
 
 def _unusable(path: Path, error: Exception) -> SvgfError:
+    why = f" ({error})" if isinstance(error, ValueError | OSError) else ""  # others speak of Python
     return SvgfError(
-        f"Cannot resume from {path}: it is damaged or of another version ({error}). "
+        f"Cannot resume from {path}: it is damaged or of another version{why}. "
         "Start again with --overwrite, or into another folder."
     )
 

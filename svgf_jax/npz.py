@@ -25,7 +25,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     except FileNotFoundError:
         raise
     except Exception as error:
-        raise ValueError(str(error) or type(error).__name__) from error
+        told = isinstance(error, ValueError | OSError | zipfile.BadZipFile) and str(error)
+        raise ValueError(told or "not whole arrays in a zip file") from error
 
 
 def _check_sizes(raw: BinaryIO) -> None:

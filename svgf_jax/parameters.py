@@ -112,6 +112,14 @@ def load_params(path: str | os.PathLike[str]) -> tuple[Params, Config]:
     file = read_toml(Path(path), "parameter file")
     _check_keys(file)
     content = file.content
+    if (
+        "schema" in content and "preset" not in content and not file.text.endswith("\n")
+    ):  # as `save_params` never writes it
+        last = file.text.rpartition("\n")[2]
+        raise SvgfError(
+            f"{file.path}: the file is cut off, perhaps within a number: it ends with {last!r}. Wanted all of it; if it is all, "
+            "end the last line."
+        )
     try:
         params, config = preset(content.get("preset", "paper"))
     except (SvgfError, TypeError) as error:

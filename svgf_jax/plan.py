@@ -269,8 +269,8 @@ def _resume(plan: Plan) -> Checkpoint | None:
         check_there(plan)
         return None
     start = checkpoint.load_checkpoint(plan.state, plan.identity)
+    checkpoint.check_same(plan.state, saved, plan.identity, used=0)
     if start is None:
-        checkpoint.check_same(plan.state, saved, plan.identity, used=0)
         return Checkpoint(0, None)
     check_there(plan, start.next_index)
     return start

@@ -86,3 +86,13 @@ def test_fewer_levels_do_not_silently_drop_per_level_values():
     params, config = override(*sj.preset("paper"), {"sigma_normal": [1.0, 2.0, 3.0, 4.0, 5.0]})
     with pytest.raises(sj.SvgfError, match="4 levels"):
         override(params, config, {"levels": 4})
+
+
+def test_a_file_cut_off_within_a_number_is_not_taken_for_whole(tmp_path):
+    whole, cut = tmp_path / "whole.toml", tmp_path / "cut.toml"
+    sj.save_params(whole, sj.Params(sigma_depth=12.5))
+    cut.write_text(whole.read_text().partition("12.5")[0] + "1")
+    with pytest.raises(sj.SvgfError, match=r"cut.toml: the file is cut off.* ends with 'sigma_depth = 1'"):
+        sj.load_params(cut)
+    cut.write_text("[params]\nsigma_depth = 1")  # written by hand
+    assert sj.load_params(cut)[0].sigma_depth == 1

@@ -238,6 +238,7 @@ def command(
         terminal.tell(f"interrupted; go on with the same command and --resume ({checkpoint.name})")
         return 130
     checkpoint.unlink(missing_ok=True)
+    terminal.warn(f"{note} (as said before the fit)" for note in doubts if note not in opening)
     if found.diverged:
         return 1
     if code and accept:
