@@ -194,9 +194,12 @@ def _gather(pixels: Pixels, *, size: int, scalars: Params) -> tuple[Cells, tuple
     p, p_slope = jax.tree.map(partial(spread, size=size), centre)
     distance = jnp.asarray(from_centre(size), known.dtype)
     dx = jnp.asarray(np.tile(from_centre(size), known.shape[1] // size)[None], known.dtype)
+    colors = tuple(zip(current, history, moments, strict=True))
+    rows = jax.tree.map(lambda a: a.reshape(-1, size, a.shape[1]), (guides, known, colors))
 
-    def add(sums, row):
-        q, with_history, colors, dy = row
+    def add(sums, at):
+        row, dy = at
+        q, with_history, colors = jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, row, 1, 1)[:, 0], rows)
         known = with_history * p.surface * q.surface > 0.0
         weight = _weight(p, q, p_slope, dy, dx, scalars, where=known)
         weights, squares, totals = sums
@@ -204,11 +207,9 @@ def _gather(pixels: Pixels, *, size: int, scalars: Params) -> tuple[Cells, tuple
         totals = jax.tree.map(lambda total, value: total + weight * value, totals, values)
         return (weights + weight, squares + weight * weight, totals), None
 
-    colors = tuple(zip(current, history, moments, strict=True))
-    zero = jnp.zeros_like(dx)
+    zero = jnp.zeros_like(p.depth)
     nothing = tuple(Sums((zero,) * 3, (zero,) * 3, zero, zero, zero, zero) for _ in colors)
-    rows = jax.tree.map(lambda a: a[:, None], (guides, known, colors))
-    sums, _ = lax.scan(add, (zero, zero, nothing), (*rows, distance))
+    sums, _ = lax.scan(add, (zero, zero, nothing), (jnp.arange(size), distance))
     weight, square, totals = jax.tree.map(partial(gathered, size=size), sums)
     return Cells(centre[0], centre[1], weight, square), totals
 
@@ -222,14 +223,33 @@ def _compare(current: Color, history: Color, moments) -> Sums:
 
 
 def _judge(cells: Cells, sums: tuple[Sums, ...], *, size: int, scalars: Params) -> tuple[Correction, ...]:
-    """Steps 1 and 2 of the module's docstring, on the grid of cells."""
+    """Steps 1 and 2 of the module's docstring, on the grid of cells. What a strip gives back is new: all else would be copied."""
     one, zero = (jnp.asarray(number, cells.weight.dtype) for number in (1.0, 0.0))
     as_it_is = (Correction((one,) * 3, (zero,) * 3, one, one, zero),) * len(sums)
-    compared = in_strips(lambda sums: _correct_sums(sums, as_it_is), sums)
-    wide = _pool(cells, compared, levels=GAIN_LEVELS, size=size, scalars=scalars)
-    gains = in_strips(partial(_gains, threshold=scalars.light_gain_threshold), *wide)
-    narrow = _pool(cells, in_strips(_correct_sums, sums, gains), levels=OFFSET_LEVELS, size=size, scalars=scalars)
-    return in_strips(partial(_offsets, threshold=scalars.light_offset_threshold), *narrow, gains)
+    pool = partial(_pool, cells, size=size, scalars=scalars)
+
+    def as_it_was(sums) -> list[Array]:
+        return [compared.square for compared in _correct_sums(sums, as_it_is)]
+
+    def after_gain(wide, sums):
+        gains = _gains(*_means(*wide, levels=GAIN_LEVELS), threshold=scalars.light_gain_threshold)
+        left = [compared._replace(current=()) for compared in _correct_sums(sums, gains)]
+        return [gain._replace(offset=()) for gain in gains], left
+
+    def after_offset(narrow, gains) -> list[Correction]:
+        means = _means(*narrow, levels=OFFSET_LEVELS)
+        corrections = _offsets(*means, gains, threshold=scalars.light_offset_threshold)
+        return [correction._replace(gain=(), luminance_gain=()) for correction in corrections]
+
+    squares = in_strips(as_it_was, sums)
+    compared = tuple(Compared(s.current, s.previous, square, s.noise) for s, square in zip(sums, squares, strict=True))
+    gains, left = in_strips(after_gain, pool(compared, levels=GAIN_LEVELS), sums)
+    left = tuple(compared._replace(current=s.current) for compared, s in zip(left, sums, strict=True))
+    found = in_strips(after_offset, pool(left, levels=OFFSET_LEVELS), gains)
+    return tuple(
+        gain._replace(offset=offset.offset, keep=offset.keep, variance=offset.variance)
+        for gain, offset in zip(gains, found, strict=True)
+    )
 
 
 def _gains(effective: Array, wide: tuple[Compared, ...], *, threshold) -> tuple[Correction, ...]:
@@ -268,9 +288,8 @@ def _correct_sums(sums: tuple[Sums, ...], corrections: tuple[Correction, ...]) -
 
 
 def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, scalars: Params):
-    """1 / (effective number of pixels) of ever wider neighbourhoods of cells, and the means over them."""
+    """Sums over ever wider neighbourhoods of cells: of the weights, of their squares, and of `sums`."""
     kernel = np.outer(_B3, _B3).reshape(-1)
-    shared = shared_paths(levels)
     away = jnp.asarray(_OFFSETS * size, cells.weight.dtype)
 
     def tap(sums, q, p, t):
@@ -299,15 +318,17 @@ def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, s
             largest_step=2 ** (levels - 1),
         ), None
 
-    state, _ = lax.scan(level, (cells.weight, cells.square, sums), 2 ** jnp.arange(levels, dtype=jnp.int32))
+    return lax.scan(level, (cells.weight, cells.square, sums), 2 ** jnp.arange(levels, dtype=jnp.int32))[0]
 
-    def means(weight: Array, square: Array, totals):
-        some = weight > _TINY
-        divisor = jnp.where(some, weight, 1.0)
-        effective = jnp.where(some, jnp.minimum(shared * square / divisor / divisor, 1.0), 1.0)
-        return effective, jax.tree.map(lambda t: jnp.where(some, t / divisor, 0.0), totals)
 
-    return in_strips(means, *state)
+def _means(
+    weight: Array, square: Array, totals: tuple[Compared, ...], *, levels: int
+) -> tuple[Array, tuple[Compared, ...]]:
+    """1 / (effective number of pixels) of neighbourhoods that `_pool` added up, and the means over them."""
+    some = weight > _TINY
+    divisor = jnp.where(some, weight, 1.0)
+    effective = jnp.where(some, jnp.minimum(shared_paths(levels) * square / divisor / divisor, 1.0), 1.0)
+    return effective, jax.tree.map(lambda t: jnp.where(some, t / divisor, 0.0), totals)
 
 
 def shared_paths(levels: int) -> float:

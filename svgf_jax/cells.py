@@ -1,4 +1,4 @@
-"""Cells of size x size pixels, worked on row by row so that all stays in the cache: pixels in, cells or pixels out.
+"""Cells of size x size pixels, worked on in strips of rows that stay in the cache: pixels in, cells or pixels out.
 
 XLA:CPU computes with planes whose rows are read as they lie in memory. So nothing here is cut or spread along a row where it is
 computed with: a cell's values are brought to all pixels of a row first, and the sums of a row are added up by cells last.
@@ -13,9 +13,10 @@ import numpy as np
 from jax import Array, lax
 
 from svgf_jax.edges import NEVER, Guides
-from svgf_jax.sampling import Planes, split_rows
+from svgf_jax.sampling import Planes, map_strips
 
 Color = tuple[Array, ...]  # red, green, blue
+CELL_STRIP_PIXELS = 24576  # of a strip: larger ones cost fewer turns of the loop, but leave the level-2 cache
 
 
 class Pixels(NamedTuple):
@@ -45,19 +46,19 @@ class Corner(NamedTuple):
 
 
 def to_cells(function: Callable[[Pixels], Planes], pixels: Pixels, *, size: int) -> Planes:
-    """`function` of one row of cells after the other: it gets their pixels, planes `[size, w size]`, and returns planes `[1, w]`.
+    """`function` of some rows of cells after the other: gets their pixels, planes `[n size, w size]`, and returns planes `[n, w]`.
 
     Beyond the image the pixels are 0. Returns planes of cells.
     """
     down = -(-pixels.known.shape[0] // size)
-    found = lax.map(jax.checkpoint(function, prevent_cse=False), _split(pixels, size, size))  # type: ignore[arg-type]
+    found = map_strips(jax.checkpoint(function, prevent_cse=False), _split(pixels, size))  # type: ignore[arg-type]
     return jax.tree.map(lambda a: a.reshape(-1, a.shape[-1])[:down], found)
 
 
 def to_pixels(
     function: Callable[[Pixels, list[Corner]], Planes], pixels: Pixels, cells: Planes, *, size: int
 ) -> Planes:
-    """`function(pixels, corners)` of some rows of pixels after the other, which lie between the same two rows of cells' centres.
+    """`function(pixels, corners)` of some rows of pixels after the other.
 
     Args:
         function: planes of pixels `[n, w size]` and the four corners -> planes of pixels.
@@ -69,48 +70,55 @@ def to_pixels(
         Planes of pixels.
     """
     height, width = pixels.known.shape
-    band = size // 2 if size % 2 == 0 else 1  # rows of pixels
-    split = _split(pixels, band, size)
-    count, _, columns = split.known.shape
+    split = _split(pixels, size)
+    count, rows, columns = split.known.shape
     dtype = pixels.known.dtype
+    first_centre = size - size // 2  # from the margin's first pixel to the first pixel whose cell above is the margin's
     # Spread here and not where they are read: the compiler would spread them anew for every use, and pixel by pixel.
-    cells = jax.tree.map(lambda a: spread(jnp.pad(a, ((0, size), (0, 0))), size), cells)
+    cells = jax.tree.map(lambda a: spread(jnp.pad(a, ((0, 1), (0, size))), size), cells)
     offset = from_centre(size)
     first = np.where(offset < 0, -size, 0) - offset  # from a pixel to the first of the two cells' centres along an axis
     with np.errstate(divide="ignore"):
         log_share = np.maximum(np.log(np.stack([1 + first / size, -first / size])), NEVER)
     along = lambda a: jnp.asarray(np.tile(a, columns // size)[None], dtype)  # noqa: E731
-    down = lambda a: jnp.asarray(np.resize(a, (count, band, 1)), dtype)  # noqa: E731
-    above = (np.arange(count) * band + size - size // 2) // size
+    down = lambda a: jnp.asarray(np.tile(a, rows // size)[:, None], dtype)  # noqa: E731
 
-    def rows(given: tuple[Pixels, tuple[Array, Array], Array, tuple[Array, Array]]) -> Planes:
-        pixels, cells_rows, dy, log_y = given
+    def strip(given: tuple[Pixels, Array]) -> Planes:
+        pixels, above = given
         corners = []
         for i, j in np.ndindex(2, 2):
-            corner = (cells_rows[i], jnp.int32(size - size // 2 + j * size))
-            read = lambda a, at=corner: jnp.broadcast_to(lax.dynamic_slice(a, at, (1, columns)), (band, columns))  # noqa: E731
-            log = log_y[i] + along(log_share[j])
-            corners.append(Corner(jax.tree.map(read, cells), log, dy + i * size, along(first + j * size)))
+            corner = (above + i, jnp.int32(first_centre + j * size))
+
+            def read(a: Array, at=corner) -> Array:
+                some = lax.dynamic_slice(a, at, (rows // size + 1, columns))
+                every = jnp.broadcast_to(some[:, None], (rows // size + 1, size, columns))
+                return every.reshape(-1, columns)[first_centre : first_centre + rows]
+
+            log = down(log_share[i]) + along(log_share[j])
+            corners.append(Corner(jax.tree.map(read, cells), log, down(first) + i * size, along(first + j * size)))
         return function(pixels, corners)
 
-    places = tuple(jnp.asarray(above + i, jnp.int32) for i in range(2))
-    given = split, places, down(first), tuple(map(down, log_share))
-    found = lax.map(jax.checkpoint(rows, prevent_cse=False), given)  # type: ignore[arg-type]
+    given = split, jnp.arange(count, dtype=jnp.int32) * (rows // size)
+    found = map_strips(jax.checkpoint(strip, prevent_cse=False), given)  # type: ignore[arg-type]
     return jax.tree.map(lambda a: a.reshape(-1, columns)[:height, :width], found)
 
 
-def _split(pixels: Pixels, rows: int, size: int) -> Pixels:
-    """`[H, W]` -> `[count, rows, w size]`, 0 beyond the image."""
+def _split(pixels: Pixels, size: int) -> Pixels:
+    """`[H, W]` -> `[count, n size, w size]`, 0 beyond the image."""
     height, width = pixels.known.shape
-    across = -(-width // size) * size
-    count, _ = split_rows(-(-height // rows), across, 1)
+    down, across = -(-height // size), -(-width // size) * size
+    wanted = max(1, CELL_STRIP_PIXELS // (across * size))
+    rows = size * next(
+        n for n in range(min(wanted, max(1, down // 2)), 0, -1) if down % n == 0
+    )  # or else all was copied
+    count = max(2, size * down // rows)  # two at least: see `split_rows`
     pad = lambda a: jnp.pad(a, ((0, count * rows - height), (0, across - width)))  # noqa: E731
     return jax.tree.map(lambda a: pad(a).reshape(count, rows, across), pixels)
 
 
 def at_centres(plane: Array, size: int) -> Array:
-    """The central pixels `[1, w]` of a row of cells."""
-    return plane[size // 2 : size // 2 + 1, size // 2 :: size]
+    """The central pixels `[n, w]` of some rows of cells."""
+    return plane[size // 2 :: size, size // 2 :: size]
 
 
 def spread(cells: Array, size: int) -> Array:

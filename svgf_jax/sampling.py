@@ -223,6 +223,23 @@ def sum_over_taps(
     return jax.tree.map(lambda a: a.reshape(count * rows, width)[:height], result)
 
 
+def map_strips(function: Callable[[Any], Planes], strips: Any) -> Planes:
+    """`lax.map(function, strips)`, whose results take no memory before the strips, `[n, rows, W]`, are there.
+
+    `lax.map` starts its results as zeros, and XLA:CPU makes those of all loops at the very beginning of a step.
+    """
+    leaves = jax.tree.leaves(strips)
+    some = lax.stop_gradient(leaves[0][0, 0, 0])  # any number: all is written over
+    shapes = jax.eval_shape(function, jax.tree.map(lambda a: a[0], strips))
+    start = jax.tree.map(lambda s: jnp.full((len(leaves[0]), *s.shape), some.astype(s.dtype)), shapes)
+
+    def put(results: Planes, at: Any) -> tuple[Planes, None]:
+        i, strip = at
+        return jax.tree.map(lambda a, b: lax.dynamic_update_index_in_dim(a, b, i, 0), results, function(strip)), None
+
+    return lax.scan(put, start, (jnp.arange(len(leaves[0])), strips))[0]
+
+
 def in_strips(function: Callable[..., Planes], *images: Planes, strip_rows: int = BY_WIDTH) -> Planes:
     """Run pixel-wise arithmetic strip by strip: it stays in the cache, and is compiled, hence rounded, the same wherever it is.
 
@@ -238,7 +255,7 @@ def in_strips(function: Callable[..., Planes], *images: Planes, strip_rows: int 
     count, rows = split_rows(height, width, strip_rows)
     padded = jax.tree.map(lambda a: jnp.pad(a, ((0, count * rows - height), (0, 0))), images)
     split = jax.tree.map(lambda a: a.reshape(count, rows, width), padded)
-    result = lax.map(lambda strips: function(*strips), split)
+    result = map_strips(lambda strips: function(*strips), split)
     return jax.tree.map(lambda a: a.reshape(count * rows, width)[:height], result)
 
 

@@ -362,7 +362,8 @@ def test_the_effective_number_is_that_of_the_errors_seen(levels):
     def pooled(noise):
         color = (noise,) * 3
         sums = (adaptation.Compared(color, color, noise, noise),)
-        effective, (mean,) = adaptation._pool(cells, sums, levels=levels, size=4, scalars=at_level(PARAMS, 0))
+        totals = adaptation._pool(cells, sums, levels=levels, size=4, scalars=at_level(PARAMS, 0))
+        effective, (mean,) = adaptation._means(*totals, levels=levels)
         return effective[size // 2, size // 2], mean.current[0][size // 2, size // 2]
 
     noise = np.random.default_rng(6).normal(size=(trials, size, size))

@@ -122,18 +122,20 @@ def check_paths(module):
 
 def check_cells(module):
     """Cells that hold their centres' places: sums of a cell's pixels, and where a pixel finds the four around it."""
-    height, width, size = 10, 9, 4
+    height, width, size = 14, 9, 4  # two strips of two rows of cells
     y, x = np.mgrid[0:height, 0:width].astype(float)
     one = np.ones((height, width))
     pixels = module.Pixels(Guides(y, (x, x, x), one), (y, x), one, (), (), ())
 
     def sums(p):
-        return module.at_centres(p.guides.depth, size), module.gathered(p.known.sum(axis=0, keepdims=True), size)
+        return module.at_centres(p.guides.depth, size), module.gathered(
+            p.known.reshape(-1, size, p.known.shape[1]).sum(axis=1), size
+        )
 
     centres, count = module.to_cells(sums, pixels, size=size)
-    near(centres, [[2.0, 2.0, 0.0], [6.0, 6.0, 0.0], [0.0] * 3])  # beyond the image is 0
-    near(count, [[16.0, 16.0, 4.0], [16.0, 16.0, 4.0], [8.0, 8.0, 2.0]])
-    down, right = np.mgrid[-1:4, -1:4] * 4.0 + 2.0  # with the margin
+    near(centres, [[2.0, 2.0, 0.0], [6.0, 6.0, 0.0], [10.0, 10.0, 0.0], [0.0] * 3])  # beyond the image is 0
+    near(count, [[16.0, 16.0, 4.0]] * 3 + [[8.0, 8.0, 2.0]])
+    down, right = np.mgrid[-1:5, -1:4] * 4.0 + 2.0  # with the margin
 
     def look(p, corners):
         share = [np.e**c.log_share for c in corners]
@@ -221,12 +223,12 @@ CHECKS = {
         "paths that meet in rows alone": ("(_B3**2).sum() ** levels) ** 2)", "(_B3**2).sum() ** levels))"),
     },
     check_cells: {
-        "centre at the upper left": ("plane[size // 2 : size // 2 + 1,", "plane[0:1,"),
+        "centre at the upper left": ("plane[size // 2 :: size,", "plane[::size,"),
         "a column of each cell lost": ("for b in range(1, size)", "for b in range(2, size)"),
-        "cells of the row above": ("size - size // 2) // size", "size - size // 2 - size) // size"),
-        "cells half a cell away": ("jnp.int32(size - size // 2 + j * size)", "jnp.int32(size + j * size)"),
+        "cells of the row above": ("[first_centre : first_centre + rows]", "[:rows]"),
+        "cells half a cell away": ("jnp.int32(first_centre + j * size)", "jnp.int32(size + j * size)"),
         "shares exchanged": ("np.stack([1 + first / size, -first / size])", "np.stack([-first / size, 1 + first / size])"),
-        "the second row of cells where the first is": ("dy + i * size", "dy"),
+        "the second row of cells where the first is": ("down(first) + i * size", "down(first)"),
     },
     check_mirror: {
         "seen from the origin": ("away = position - _eye(camera)", "away = position - 0.0"),
