@@ -11,11 +11,12 @@ import numpy as np
 
 from svgf_jax import preview, streaming
 from svgf_jax.comparison import compare_sequences
+from svgf_jax.filing import FrameReport
 from svgf_jax.frames import open_source
 from svgf_jax.metrics import Scores, mean_scores
 from svgf_jax.references import read_radiance
 from svgf_jax.sequences import find_sequence
-from svgf_jax.streaming import FrameReport, Summary
+from svgf_jax.streaming import Summary
 from svgf_jax.types import Config, Params, SvgfError
 
 EXPOSURE = 1.6

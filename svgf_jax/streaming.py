@@ -13,47 +13,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from svgf_jax import __version__, checkpoint, exr, frames, memory, outputs, preview, tonemapping
+from svgf_jax import __version__, checkpoint, filing, frames, outputs, preview, tonemapping
 from svgf_jax.checkpoint import Checkpoint
 from svgf_jax.compiled import Filters, Pipeline, check_devices, compile_filters, to_host, wait
+from svgf_jax.filing import FrameReport
 from svgf_jax.methods import MethodConfig
 from svgf_jax.outputs import WriteOptions
-from svgf_jax.plan import Files, Plan, begin, check_there, locked, make_plan, stamp, stamp_frame
+from svgf_jax.plan import Files, Plan, begin, check_there, locked, make_plan, stamp
 from svgf_jax.threads import Submit, read_ahead, write_behind
-from svgf_jax.types import Config, Frame, History, Output, Params, SvgfError
+from svgf_jax.types import Config, History, Output, Params, SvgfError
 
 MANY_PIXELS = 2**20
 """Frames of more are read and written one at a time, for the sake of memory."""
 
 _NEVER_READ = ("illumination", "variance_filtered")
 _DIAGNOSTICS = ("variance", "change", "valid")
-
-
-class FrameReport(NamedTuple):
-    """What became of one frame.
-
-    Attributes:
-        number: the frame number.
-        status: "filtered", "held" (missing: the frame before it written again), "skipped" (missing: nothing written) or
-            "warm-up" (before the range that is written).
-        path: the output, None if skipped or before the range.
-        counts: pixels repaired on loading, before filtering and on writing, by reason, and those of the output that are
-            `not_finite`, which should never happen; only those above 0.
-        notes: anything else worth telling, as sentences.
-        history: mean history length of its surfaces in frames; None if there are none, or nothing was filtered.
-        seconds: since the frame before was complete, or since the run began: reading, filtering and writing, which
-            overlap, and for the first the compilation too.
-    """
-
-    number: int
-    status: str
-    path: Path | None
-    counts: dict[str, int]
-    notes: tuple[str, ...]
-    history: float | None = None
-    seconds: float = 0.0
 
 
 class Summary(NamedTuple):
@@ -172,10 +146,10 @@ def run(
         start = begin(plan, resume=resume, overwrite=overwrite)
         end = len(plan.files)
         if start is not None:
-            read = partial(_read, source, plan)
-            write = partial(_write, source, plan, options, provenance, on_output, still_locked)
-            fill_gap = partial(_fill_gap, plan, still_locked)
-            save = partial(_save, plan, still_locked)
+            read = partial(filing.read, source, plan)
+            write = partial(filing.write, source, plan, options, provenance, on_output, still_locked)
+            fill_gap = partial(filing.fill_gap, plan, still_locked)
+            save = partial(filing.save, plan, still_locked)
             workers = threads if threads == 1 else 2 * threads  # one writes a frame before it reads the next
             with (
                 ThreadPoolExecutor(workers, thread_name_prefix="svgf-files") as pool,
@@ -202,7 +176,7 @@ def run(
             still_locked()
             check_there(plan, end, ending=True)
             if plan.video is not None:
-                preview.write_video(plan.video, _pictures(plan, options), fps=fps)
+                preview.write_video(plan.video, filing.pictures(plan, options), fps=fps)
             checkpoint.save_run(plan.state, plan.identity, complete=True)
             checkpoint.remove_checkpoint(plan.state)
     return Summary(
@@ -303,12 +277,6 @@ def _filter(
     return len(plan.files)
 
 
-def _save(plan: Plan, still_locked: Callable[[], None], state: Checkpoint) -> None:
-    """Keep the history. Runs in a background thread, once every output before is complete."""
-    still_locked()
-    checkpoint.save_checkpoint(plan.state, plan.identity, state)
-
-
 def _identity(source: frames.Source, options: WriteOptions, provenance: Mapping[str, str]) -> checkpoint.Identity:
     """Whatever the outputs depend on, but for the parameters and the input frames."""
     return {
@@ -327,25 +295,6 @@ def _camera_files(source: frames.Source) -> list[Files]:
     return [source.cameras.files] if source.cameras and source.cameras.files else []
 
 
-def _read(source: frames.Source, plan: Plan, index: int) -> frames.LoadedFrame | None:
-    """One frame. Of a file that was replaced since the run began, the new content counts, and the run's record says so."""
-    if source.sequence.files[index][1] is None:
-        return None
-    before = stamp_frame(plan, index)
-    item = frames.read_frame(source, index)
-    if stamp_frame(plan, index) != before:
-        raise SvgfError(f"{item.path}: changed while it was read. Go on with --resume once it is complete.")
-    if before != plan.identity["frames"][index]:
-        plan.identity["frames"][index] = before
-        item = item._replace(
-            notes=(*item.notes, f"{item.path} changed while the run went on; taken as it was when read")
-        )
-    if (np.asarray(item.frame.object_id) == -1).all():
-        item = item._replace(notes=(*item.notes, "a frame without any surface: it passed through unfiltered"))
-    frame, item = list(item.frame), item._replace(frame=None)  # type: ignore[arg-type]
-    return item._replace(frame=Frame(*memory.aligned(frame)))
-
-
 def _pixels(source: frames.Source) -> int:
     left, top, right, bottom = source.data_window
     return (right - left + 1) * (bottom - top + 1)
@@ -361,58 +310,3 @@ def _check_size(item: frames.LoadedFrame, history: History | None) -> None:
             f"{item.path}: this frame is {now[1]} x {now[0]} pixels, the one before it {then[1]} x {then[0]}; wanted one "
             "size throughout. Denoise each part as a sequence (--frames)."
         )
-
-
-def _write(
-    source: frames.Source,
-    plan: Plan,
-    options: WriteOptions,
-    provenance: Mapping[str, str],
-    on_output: Callable[[frames.LoadedFrame, Output], object] | None,
-    still_locked: Callable[[], None],
-    index: int,
-    item: frames.LoadedFrame,
-    output: Output,
-) -> FrameReport:
-    """Bring one frame's output to the host and onto the disk. Runs in a background thread."""
-    path = plan.outputs[index]
-    if path is None:
-        return FrameReport(plan.files[index][0], "warm-up", None, {}, ())
-    output = to_host(output, item.path)
-    if on_output is not None:
-        on_output(item, output)
-    image, clipped = outputs.compose(
-        output, item.image, options=options, signals=source.roles.signals, attributes=provenance
-    )
-    notes = list(item.notes)
-    still_locked()
-    if dropped := outputs.write_frame(path, image, options=options):
-        notes.append(f"header attributes that could not be passed through: {', '.join(dropped)}")
-    broken = int(np.count_nonzero(~np.isfinite(output.image).all(axis=-1)))
-    rejected = {name: int(count) for name, count in output.rejected._asdict().items()}
-    counts = Counter(item.counts) + Counter(rejected) + Counter(clipped=clipped, not_finite=broken)
-    lengths = output.history_length[output.history_length > 0]
-    history = float(np.mean(lengths)) if lengths.size else None
-    return FrameReport(plan.files[index][0], "filtered", path, dict(counts), tuple(notes), history)
-
-
-def _fill_gap(plan: Plan, still_locked: Callable[[], None], index: int) -> FrameReport:
-    """Stand in for a missing frame: the output before it again, or nothing. Runs once that output is complete."""
-    number, path = plan.files[index][0], plan.outputs[index]
-    if index < plan.warmup:
-        return FrameReport(number, "warm-up", None, {}, ())
-    if path is None:
-        return FrameReport(number, "skipped", None, {}, ())
-    before = plan.outputs[index - 1]
-    assert before is not None  # the first frame of a plan that holds is there
-    still_locked()
-    for suffix in (".exr", ".png") if plan.png else (".exr",):
-        preview.copy_file(before.with_suffix(suffix), path.with_suffix(suffix))
-    return FrameReport(number, "held", path, {}, ())
-
-
-def _pictures(plan: Plan, options: WriteOptions) -> Iterator[np.ndarray]:
-    """The outputs as 8-bit pictures, read back one at a time."""
-    for path in plan.outputs:
-        if path is not None:
-            yield preview.to_8bit(outputs.beauty(exr.read(path)), exposure=options.exposure, curve=options.tonemap)

@@ -32,6 +32,7 @@ FLOORS = [
     {"arrays", "frames", "references", "pipeline", "checkpoint", "page"},
     {"baselines", "comparison", "devices", "film", "outputs", "plan", "scan", "shown", "tev", "pieces"},
     {"compiled", "estimates"},
+    {"filing"},
     {"ablation", "streaming"},
     {"demo", "report", "inspection"},
     {"findings"},

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from svgf_jax import SvgfError, checkpoint, streaming
+from svgf_jax import SvgfError, checkpoint, filing
 from svgf_jax.plan import check_writable, find_start, locked, make_plan
 
 
@@ -14,11 +14,11 @@ def test_a_missing_frame_is_not_held_in_a_folder_that_is_anothers_by_now(tmp_pat
     plan = make_plan(files, tmp_path / "out", hold=True, png=False, video=False, identity={})
     with locked(plan) as still:
         plan.outputs[0].touch()
-        assert streaming._fill_gap(plan, still, 1).status == "held"
+        assert filing.fill_gap(plan, still, 1).status == "held"
         plan.outputs[1].unlink()
         (plan.state / "lock").unlink()
         with pytest.raises(SvgfError, match="the output folder was removed"):
-            streaming._fill_gap(plan, still, 1)
+            filing.fill_gap(plan, still, 1)
     assert not plan.outputs[1].exists()
 
 

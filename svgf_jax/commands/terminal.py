@@ -16,7 +16,7 @@ from svgf_jax.spelling import visible
 from svgf_jax.types import SvgfError
 
 if TYPE_CHECKING:
-    from svgf_jax.streaming import FrameReport
+    from svgf_jax.filing import FrameReport
 
 
 REPAIRS = {
