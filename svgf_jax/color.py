@@ -3,7 +3,7 @@
 from typing import Any
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from svgf_jax.sampling import planes, stack_planes
 
@@ -47,10 +47,16 @@ def demodulate(radiance: Array, albedo: Array, *, albedo_floor: Array | float = 
     divisors = jnp.broadcast_to(jnp.maximum(albedo, albedo_floor), radiance.shape)
     return stack_planes(  # the quotient last: XLA:CPU then computes a plane once, whoever reads it
         tuple(
-            tuple(jnp.minimum(r, largest * d) / d for r, d in zip(planes(signal), planes(divisor), strict=True))
+            tuple(_quotient(r, d, largest) for r, d in zip(planes(signal), planes(divisor), strict=True))
             for signal, divisor in zip(radiance, divisors, strict=True)
         )
     )
+
+
+def _quotient(light: Array, divisor: Array, largest: float) -> Array:
+    """At most `largest`, where it does not change with the divisor: derivatives of the two would be beyond float32 each."""
+    divisor = jnp.where(light < largest * divisor, divisor, lax.stop_gradient(divisor))
+    return jnp.minimum(light, largest * divisor) / divisor
 
 
 def remodulate(illumination: Array, albedo: Array, *, albedo_floor: Array | float = 1e-3) -> Array:

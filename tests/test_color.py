@@ -1,5 +1,7 @@
 """Colour arithmetic at its ends: light too bright for the sums of the filter is held back, all other light is not touched."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -24,3 +26,10 @@ def test_luminance_has_a_square_that_can_be_summed(dtype, most):
     assert np.isfinite((np.full(4095, most, dtype) ** 2).sum(dtype=dtype))
     brightest = color.luminance_of_moments((np.full((1, 1), most * 2, dtype),) * 3)
     np.testing.assert_allclose(brightest, most / 2**14, rtol=1e-6)
+
+
+def test_light_held_at_its_largest_does_not_change_with_the_albedo():
+    """The derivative of min(r, most d) / d would be inf - inf."""
+    radiance, albedo = (jnp.full((1, 2, 2, 3), value, jnp.float32) for value in (3e38, 1e-4))
+    loss = lambda floor: jnp.sum(1e3 * color.demodulate(radiance, albedo, albedo_floor=floor))  # noqa: E731
+    assert jax.grad(loss)(jnp.float32(1e-3)) == 0.0
