@@ -26,8 +26,8 @@ def largest_luminance(dtype: Any) -> float:
 
 
 def luminance_of_moments(color: tuple[Array, ...]) -> Array:
-    """Luminance as the moments take it, limited: its square times the derivatives of what becomes of it stays finite."""
-    return jnp.minimum(luminance_of_planes(*color), largest_luminance(color[0].dtype) / 2**14)
+    """Luminance as the moments take it: limited, so that its square is finite."""
+    return jnp.minimum(luminance_of_planes(*color), largest_luminance(color[0].dtype))
 
 
 def demodulate(radiance: Array, albedo: Array, *, albedo_floor: Array | float = 1e-3) -> Array:
