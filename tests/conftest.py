@@ -1,5 +1,6 @@
 """Strict by default: dtype and rank promotion are errors, float64 is on (tests choose their dtypes themselves)."""
 
+import gc
 import runpy
 from pathlib import Path
 
@@ -26,6 +27,13 @@ LONGEST = (
     "test_pipeline_oracle",
     "test_mutants",
 )
+
+
+def pytest_collection_finish():
+    """Tracing makes many objects and little garbage: looked for seldom, it takes three quarters of the time."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
 
 
 def pytest_collection_modifyitems(items):
