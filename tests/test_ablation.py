@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import shots
 from bridge import jitted_denoise
+from calling import command, observed
 from test_api import frame_of_zeros
-from test_cli import command, observed
 
 from svgf_jax import SvgfError, ablation, load_sequence, metrics, open_source, preset, read_radiance
 from svgf_jax.commands import ablate as ablate_command

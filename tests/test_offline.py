@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from urllib.request import urlopen
 
+import calling
 import pytest
-import test_cli
 import test_tune_command
 
 ASKED = [
@@ -31,7 +31,7 @@ def test_this_machine_may_be_asked():
         socket.create_connection(server.getsockname()).close()
 
 
-@pytest.mark.parametrize("module", [test_cli, test_tune_command])
+@pytest.mark.parametrize("module", [calling, test_tune_command])
 def test_commands_that_tests_start_are_denied_it(module):
     code = "import socket; socket.create_connection(('192.0.2.1', 80), timeout=1)"
     environment = os.environ | {"PYTHONPATH": module.SEARCHED}
