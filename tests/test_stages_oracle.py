@@ -294,7 +294,7 @@ def test_feedback(feedback_level):
 
 def test_the_plain_form_of_the_loops():
     c = case()
-    plain = atrous.atrous_level(c.accumulated, c.variance, c.frame, level=0, params=c.params, strip_rows=None)
+    plain = compiled(atrous.atrous_level, c.accumulated, c.variance, c.frame, level=0, params=c.params, strip_rows=None)
     assert_close(plain[0], c.level(0)[0])
     assert_close(plain[1], c.level(0)[1])
 
@@ -303,7 +303,7 @@ def test_the_plain_form_of_the_levels():
     c = case()
     choices = {"params": c.params, "config": to_config({"levels": 2, "feedback_level": 0})}
     fast = compiled(atrous.atrous_filter, c.accumulated, c.variance, c.frame, **choices, strip_rows=4)
-    plain = atrous.atrous_filter(c.accumulated, c.variance, c.frame, **choices, strip_rows=None)
+    plain = compiled(atrous.atrous_filter, c.accumulated, c.variance, c.frame, **choices, strip_rows=None)
     for one, other in zip(fast, plain, strict=True):
         assert_close(np.asarray(other), one)
 
