@@ -8,6 +8,8 @@ from svgf_jax.sampling import add_up, planes
 from svgf_jax.types import Frame, Rejected
 
 _NOWHERE = 1e9  # a motion that points outside every image: no history
+_LARGEST_RADIANCE = 2.0**40
+"""Hundreds of times the sun in cd/m^2. Derivatives hold products of several radiances; of larger ones they would leave float32."""
 _LARGEST_ALBEDO = 2.0**20
 """Derivatives of what is spread to a pixel are multiplied by its albedo, and divided by the squares of others."""
 
@@ -15,11 +17,12 @@ _LARGEST_ALBEDO = 2.0**20
 def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
     """Make every number of a frame finite.
 
-    Radiance: non-finite or negative components become 0. Emission: non-finite ones become 0, negative ones stay. A non-finite
-    normal, depth, albedo or position, or a depth beyond 2e17 (in float32): no surface. A normal that is not of unit length by more
-    than 1 % is brought to it; one of zeros stays. A larger albedo than 2**20 counts as that, in dividing by it as in multiplying. A
-    non-finite motion or prev_depth: no history. Guides read 0 where there is no surface, the albedo 1. A measured variance that is
-    not finite or negative becomes -1, unknown. A non-finite reflected motion or depth: the reflection moves with the surface.
+    Radiance: non-finite or negative components become 0, those above 2**40 become that. Emission: non-finite ones become 0,
+    negative ones stay. A non-finite normal, depth, albedo or position, or a depth beyond 2e17 (in float32): no surface. A
+    normal that is not of unit length by more than 1 % is brought to it; one of zeros stays. A larger albedo than 2**20 counts
+    as that, in dividing by it as in multiplying. A non-finite motion or prev_depth: no history. Guides read 0 where there is
+    no surface, the albedo 1. A measured variance that is not finite or negative becomes -1, unknown. A non-finite reflected
+    motion or depth: the reflection moves with the surface.
 
     Args:
         frame: one frame; shapes as in `Frame`.
@@ -29,6 +32,7 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
     """
     radiance_finite, emission_finite = jnp.isfinite(frame.radiance), jnp.isfinite(frame.emission)
     radiance_positive = ~(frame.radiance < 0.0)
+    radiance_bright = radiance_finite & (frame.radiance > _LARGEST_RADIANCE)
     was_surface = frame.object_id != -1
     guided = (
         jnp.isfinite(frame.normal).all(axis=-1) & _usable(frame.depth) & jnp.isfinite(frame.albedo).all(axis=(0, 3))
@@ -40,7 +44,7 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
     normal, unusual = _to_unit_length(jnp.where(surface[..., None], frame.normal, 0.0))
 
     repaired = Frame(
-        radiance=jnp.where(radiance_finite & radiance_positive, frame.radiance, 0.0),
+        radiance=jnp.minimum(jnp.where(radiance_finite & radiance_positive, frame.radiance, 0.0), _LARGEST_RADIANCE),
         albedo=jnp.where(surface[None, :, :, None], jnp.minimum(frame.albedo, _LARGEST_ALBEDO), 1.0),
         emission=jnp.where(emission_finite, frame.emission, 0.0),
         normal=normal,
@@ -59,6 +63,7 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
         surface=add_up(was_surface & ~guided),
         motion=add_up(surface & ~traced),
         normal=add_up(unusual),
+        bright=add_up(radiance_bright.any(axis=(0, 3))),
     )
     return repaired, rejected
 

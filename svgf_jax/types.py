@@ -120,6 +120,7 @@ class Rejected(NamedTuple):
         surface: surface pixels dropped for a non-finite normal, depth or albedo.
         motion: surface pixels without history for a non-finite motion or prev_depth.
         normal: surface pixels with a normal not of unit length (brought to it).
+        bright: pixels with a radiance component above 2**40, about 1e12 (set to that), over all signals.
     """
 
     radiance: Array
@@ -128,6 +129,7 @@ class Rejected(NamedTuple):
     surface: Array
     motion: Array
     normal: Array
+    bright: Array
 
 
 class Output(NamedTuple):

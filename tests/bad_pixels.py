@@ -10,6 +10,7 @@ SIZE = (12, 16)
 FRAMES = 5
 GROWTH = 50.0  # `adaptive` may scale a history by so much in a frame, to follow the light; the others never
 F32 = np.finfo(np.float32)
+BRIGHTEST = np.float32(2**40)
 FARTHEST = float(F32.max) ** 0.5 / 2**6  # of usable depths
 
 LIGHT = (np.nan, np.inf, -np.inf, -0.5, -1e30, 1e30, 3e38, 1e-42, 0.0, 1e6, 1e-6)
@@ -95,7 +96,9 @@ def _damage(frame, channel, kind, which, where, rng):
 def sane_light(frames: Frame, albedo_floor: float) -> np.ndarray:
     """The largest sane illumination up to each frame, by signal: `[T, S]`."""
     with np.errstate(over="ignore", invalid="ignore"):
-        radiance = np.where(np.isfinite(frames.radiance) & (frames.radiance >= 0), frames.radiance, 0)
+        radiance = np.where(
+            np.isfinite(frames.radiance) & (frames.radiance >= 0), np.minimum(frames.radiance, BRIGHTEST), 0
+        )
         albedo = np.where(np.isfinite(frames.albedo), np.minimum(frames.albedo, 2**20), 1)
         light = np.minimum(radiance / np.maximum(albedo, np.float32(albedo_floor)), F32.max / 2**12)
     return np.maximum.accumulate(light.max(axis=(2, 3, 4)), axis=0)
@@ -128,6 +131,7 @@ def check(frames: Frame, output: Output, *, albedo_floor: float = 1e-3, growth: 
     counted = {
         "radiance": ~np.isfinite(frames.radiance).all((1, 4)),
         "negative": (frames.radiance < 0).any((1, 4)),
+        "bright": (np.isfinite(frames.radiance) & (frames.radiance > BRIGHTEST)).any((1, 4)),
         "emission": ~np.isfinite(frames.emission).all(-1),
         "surface": surface & ~guided,
         "motion": surface & guided & ~traced,

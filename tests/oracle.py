@@ -82,13 +82,14 @@ def sanitise(frame):
     frame = {name: np.array(value, dtype=int if name == "object_id" else float) for name, value in frame.items()}
     signals, height, width, _ = frame["radiance"].shape
     usable_motion = np.zeros((height, width), dtype=bool)
-    rejected = dict.fromkeys(("radiance", "negative", "emission", "surface", "motion", "normal"), 0)
+    rejected = dict.fromkeys(("radiance", "negative", "emission", "surface", "motion", "normal", "bright"), 0)
     for y in range(height):
         for x in range(width):
             radiance = frame["radiance"][:, y, x].reshape(-1).tolist()
             rejected["radiance"] += not all_finite(radiance)
             rejected["negative"] += any(v < 0 for v in radiance)
-            repaired = [v if isfinite(v) and v > 0 else 0.0 for v in radiance]
+            rejected["bright"] += any(isfinite(v) and v > 2.0**40 for v in radiance)
+            repaired = [min(v, 2.0**40) if isfinite(v) and v > 0 else 0.0 for v in radiance]
             frame["radiance"][:, y, x] = np.reshape(repaired, (signals, 3))
 
             emission = frame["emission"][y, x].tolist()

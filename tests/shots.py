@@ -66,6 +66,6 @@ def step(history, frame, *, params, config):
         variance_filtered=light[..., 0],
         history_length=length,
         valid=length > 1,
-        rejected=Rejected(zero, bad, zero, zero, zero, zero),
+        rejected=Rejected(zero, bad, zero, zero, zero, zero, zero),
     )
     return History(light, history.moments, length, frame.depth, frame.normal, frame.object_id), output

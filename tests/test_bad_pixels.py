@@ -11,6 +11,7 @@ import pytest
 import scenes
 from hypothesis import HealthCheck, given, settings
 
+from svgf_jax.modulation import modulate
 from svgf_jax.pipeline import init
 from svgf_jax.types import Config, Frame, Params
 
@@ -91,8 +92,9 @@ def test_what_was_repaired_is_counted(run):
     frames[0]["albedo"][0, 3, 3] = np.nan
     frames[0]["motion"][4, 4] = np.inf
     frames[0]["normal"][5, :5] *= 3
+    frames[0]["radiance"][1, 6, :4, 1] = 2e12
     counts = {name: int(count[0]) for name, count in run(stack(frames)).rejected._asdict().items()}
-    assert counts == {"radiance": 1, "negative": 3, "emission": 1, "surface": 1, "motion": 1, "normal": 5}
+    assert counts == {"radiance": 1, "negative": 3, "emission": 1, "surface": 1, "motion": 1, "normal": 5, "bright": 4}
 
 
 @pytest.mark.parametrize("length", [1e-15, 0.5, 1.02, 40.0, 1e30])
@@ -126,17 +128,21 @@ def test_light_beside_an_albedo_that_is_none_stays_finite(run):
 
 def test_the_sum_of_the_brightest_lights_stays_finite(run):
     frames = wall(1)
+    frames[0]["albedo"][:] = 1.0
+    frame = jax.tree.map(lambda leaf: leaf[0], stack(frames))
+    image = modulate(np.full_like(frame.radiance, 3e38), frame)
+    assert np.asarray(image).min() == F32.max
     frames[0]["radiance"][:] = 3e38
     frames[0]["albedo"][:] = 1e5
-    image = run(stack(frames)).image
-    assert np.isfinite(image).all()
-    assert image.max() == F32.max
+    assert np.isfinite(run(stack(frames)).image).all()
 
 
 def test_the_bound_of_the_campaign_is_a_bound():
     """`bad_pixels.check` sees what breaks it."""
     frames = stack(wall(1))
-    rejected = dict.fromkeys(("radiance", "negative", "emission", "surface", "motion", "normal"), np.zeros(1, int))
+    rejected = dict.fromkeys(
+        ("radiance", "negative", "emission", "surface", "motion", "normal", "bright"), np.zeros(1, int)
+    )
     from svgf_jax.types import Output, Rejected
 
     light = np.ones((1, 2, *bad_pixels.SIZE, 3), np.float32)

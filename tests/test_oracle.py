@@ -224,7 +224,15 @@ def test_sanitising():
     np.testing.assert_array_equal(clean["emission"][0, 1], [0, -1, 2])
     assert clean["object_id"].tolist() == [[0, 0], [-1, 0]]
     assert usable.tolist() == [[True, True], [True, False]]
-    assert rejected == {"radiance": 1, "negative": 1, "emission": 1, "surface": 1, "motion": 1, "normal": 0}
+    assert rejected == {
+        "radiance": 1,
+        "negative": 1,
+        "emission": 1,
+        "surface": 1,
+        "motion": 1,
+        "normal": 0,
+        "bright": 0,
+    }
 
 
 def test_feedback_level():

@@ -27,6 +27,7 @@ REPAIRS = {
     "normal": "with a normal not of unit length: brought to it",
     "radiance": "with non-finite radiance: set to 0",
     "negative": "with negative radiance: set to 0",
+    "bright": "with radiance above 1e12: set to that",
     "emission": "with non-finite emission: set to 0",
     "surface": "with a non-finite normal, depth or albedo: taken as background",
     "motion": "with non-finite motion or previous depth: without history",
