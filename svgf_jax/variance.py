@@ -74,11 +74,8 @@ def estimate_variance(
         )
         weight = q["guides"].surface * jnp.exp(exponent)
         weights, totals = sums
-        # Masked: in the derivative by a weight of 0 a square beyond an edge, times what it stands for, may be infinite.
-        counts = weight > 0.0
         totals = tuple(
-            (m1 + jnp.where(counts, weight * q1, 0.0), m2 + jnp.where(counts, weight * q2, 0.0))
-            for (m1, m2), (q1, q2) in zip(totals, q["moments"], strict=True)
+            (m1 + weight * q1, m2 + weight * q2) for (m1, m2), (q1, q2) in zip(totals, q["moments"], strict=True)
         )
         return weights + weight, totals
 
