@@ -17,7 +17,8 @@ Nor is it when there happens to be none: the variance is at least the one that t
 
 Then, per pixel, from the four cells around it (bilinear, geometry weights): H' = max(0, g H + o), and the moments move with it:
 M1' = g M1 + o; the variance M2 - M1^2 scales with the square of the light and turns, as s rises, into the one just observed.
-Nothing here is in Schied et al. 2017; the gradient's normalisation is that of A-SVGF (Schied et al. 2018) in other clothes.
+Nothing here is in Schied et al. 2017; comparing means of filtered differences is the idea of A-SVGF (Schied et al. 2018), the test
+against their standard error is not.
 """
 
 from functools import partial
