@@ -14,7 +14,7 @@ def main() -> None:
     with contextlib.suppress(OSError, AttributeError, ValueError):  # a closed standard error
         faulthandler.enable()  # what the EXR or the video library breaks does not end in silence
     prints.set_results_apart()
-    cli_main()
+    terminal.run_to_the_end(cli_main)
 
 
 if __name__ == "__main__":

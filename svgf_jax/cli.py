@@ -29,7 +29,9 @@ app: App = App(
     help_epilogue="`svgf-jax demo` shows it at work on a small bundled sequence.",
     version=__version__,
     help_format="plaintext",
+    suppress_keyboard_interrupt=False,  # `main` has something to say
 )
+app.meta.suppress_keyboard_interrupt = False
 app.command(denoise)
 app.command(inspect)
 app.command(compare)

@@ -58,8 +58,7 @@ def test_a_part_forgets_only_what_lies_before_its_warm_up(shot, tmp_path):
     run(shot, tmp_path / "short", "9", 4)
     run(shot, tmp_path / "none", "9", 0)
     whole, short, none = (
-        exr.read(tmp_path / name / "shot.0009.exr").channels["G"].astype(float)
-        for name in ("whole", "short", "none")
+        exr.read(tmp_path / name / "shot.0009.exr").channels["G"].astype(float) for name in ("whole", "short", "none")
     )
     assert 0 < np.abs(short - whole).mean() < 0.5 * np.abs(none - whole).mean()
 

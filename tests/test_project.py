@@ -34,11 +34,17 @@ def chosen(tmp_path, monkeypatch):
 
     def run(text, *arguments, command=("denoise", "shot", "-o", "out")):
         (tmp_path / "svgf-jax.toml").write_text(text)
-        with pytest.raises(SystemExit):
+        with pytest.raises(SystemExit) as stopped:
             cli.main([*command, *arguments])
+        assert stopped.value.code in (2, 130)
         return told
 
     return run
+
+
+def test_an_interruption_is_told(chosen, capsys):
+    chosen("")
+    assert capsys.readouterr().err.endswith("svgf-jax: interrupted; files with their final name are complete\n")
 
 
 def test_the_file_stands_behind_the_command_line(chosen, capsys):

@@ -165,6 +165,14 @@ def test_worse_validation_can_be_accepted_a_lost_solver_not(
     assert left.value.code == code
 
 
+def test_a_fit_that_is_done_is_not_resumed(shots, tmp_path, capsys):
+    (tmp_path / "t.toml").touch()
+    with pytest.raises(SystemExit) as left:
+        main([str(shots), "--reference", str(shots), "-o", str(tmp_path / "t.toml"), "--cameras", "none", "--resume"])
+    assert left.value.code == 2
+    assert "t.toml" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -173,7 +181,6 @@ def test_worse_validation_can_be_accepted_a_lost_solver_not(
         (["--reference", "{}", "--robust-width", "0"], "above 0"),
         (["--reference", "{}", "--prior", "-3"], "0 or more"),
         (["--reference", "{}", "--max-steps", "0"], "at least 1"),
-        (["--reference", "{}", "--resume"], "no checkpoint"),
         (["--reference", "{}", "--maps", "{}/cameras.json"], "wanted a folder"),
         (["--reference", "{}", "--report", "t.toml"], "two files"),
     ],

@@ -19,7 +19,9 @@ app: App = App(
     help_epilogue="The result: svgf-jax denoise INPUT -o FOLDER --params tuned.toml",
     version=__version__,
     help_format="plaintext",
+    suppress_keyboard_interrupt=False,  # `main` has something to say
 )
+app.meta.suppress_keyboard_interrupt = False
 app.default(command)
 
 
@@ -57,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except SvgfError as error:
         fail(str(error))
     except KeyboardInterrupt:
-        print("svgf-tune: interrupted", file=sys.stderr)
+        terminal.tell("svgf-tune: interrupted before there was anything to go on from")
         sys.exit(130)
     sys.exit(code if isinstance(code, int) else 0)
 
@@ -68,5 +70,10 @@ def fail(message: str) -> NoReturn:
     sys.exit(2)
 
 
+def run() -> None:
+    """The process of the command."""
+    terminal.run_to_the_end(main)
+
+
 if __name__ == "__main__":
-    main()
+    run()

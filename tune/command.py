@@ -98,7 +98,7 @@ def command(
         starts: Start from so many points, all but the first scattered about it, and keep the best.
         seed: Of the scattered starts.
         tangent_batch: Derivatives taken at a time: fewer need less memory and more time.
-        resume: Go on where an interrupted fit of the same options was.
+        resume: Go on where an interrupted fit of the same options was; begin where there was none yet.
         distributed: Share the sequences with the other processes of this job: of Slurm, Kubernetes or MPI, or by hand.
         coordinator: By hand: where process 0 is to be reached.
         processes: By hand: how many there are.
@@ -123,10 +123,9 @@ def command(
             raise SvgfError(f"{path}: there is no folder {path.absolute().parent}; make it, or choose another name.")
     if maps is not None and os.path.exists(maps) and not os.path.isdir(maps):
         raise SvgfError(f"--maps {maps} is a file; wanted a folder.")
+    resume = resume and os.path.exists(checkpoint)  # else the fit begins, unless it is done
     results.require_writable((out, report, None if maps is None else maps / MAPS), overwrite=overwrite or resume)
     results.require_writable((checkpoint,), overwrite=True)
-    if resume and not os.path.exists(checkpoint):
-        raise SvgfError(f"{checkpoint}: no checkpoint to resume from; start without --resume.")
     check_meeting(distributed, coordinator, processes, process)
     opened = reading.options()
     if flip:

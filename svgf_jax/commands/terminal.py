@@ -7,7 +7,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -37,12 +37,32 @@ REPAIRS = {
 """What became of the pixels that a frame's report counts, by its reason."""
 
 
+INTERRUPTED = (129, 130, 143)
+"""Exit codes of a run that a signal ended."""
+
+
 def tell(text: str) -> None:
     """One message on the standard error. Where nobody can read it any more, the work goes on all the same."""
     try:
         print(visible(text), file=sys.stderr, flush=True)
     except OSError:  # `2>&1 | head`, a log on a full disk, a terminal that was closed
         silence(sys.stderr)
+
+
+def run_to_the_end(command: Callable[[], None]) -> None:
+    """Run a command line as all that a process does.
+
+    Where it was interrupted the interpreter is not tidied up: threads may still compile, and would find nothing there any more.
+    """
+    try:
+        command()
+    except SystemExit as end:
+        if end.code in INTERRUPTED:
+            for stream in (sys.stdout, sys.stderr):
+                with suppress(OSError, ValueError, AttributeError):  # closed
+                    stream.flush()
+            os._exit(int(end.code))
+        raise
 
 
 def require_lines(arguments: Iterable[str]) -> None:
