@@ -1,6 +1,7 @@
 """A fit on the disk between two iterations, so that it can be resumed bit for bit: numbers only, nothing that is executed."""
 
 import json
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -115,8 +116,8 @@ def _compare(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None
     """SvgfError naming the first difference."""
     for key in sorted(stored.keys() | wanted.keys()):
         then, now = stored.get(key), wanted.get(key)
-        if isinstance(then, list) and isinstance(now, list) and len(then) == len(now):
-            then, now = next(((a, b) for a, b in zip(then, now, strict=True) if a != b), (None, None))
+        if isinstance(then, list) and isinstance(now, list):
+            then, now = next(((a, b) for a, b in zip_longest(then, now) if a != b), (None, None))
         if then != now:
             raise SvgfError(
                 f"{path}: belongs to another fit: its {key} was {then!r}, now it is {now!r}. "

@@ -149,12 +149,11 @@ def fit(
     y_start = to_free(coordinates.start, coordinates)
     chosen = solvers.make_solver(solver) if isinstance(solver, str) else solver
     fresh = solvers.begin(chosen, y_start)
+    progress = None if resume is None else resume(fresh)  # refused before work begins
     problem = pose(coordinates, y_start, residuals, shots, tangent_batch=tangent_batch, balance=balance, share=share)
-    if resume is not None:
-        progress = resume(fresh)
-        problem = problem._replace(pixel_weights=progress.pixel_weights)
-    else:
+    if progress is None:
         progress = Progress(0, fresh, (), np.inf, y_start, np.inf, None, None, problem.pixel_weights)
+    problem = problem._replace(pixel_weights=progress.pixel_weights)
     try:
         while progress.start < max(starts, 1):
             if progress.ended is None:
