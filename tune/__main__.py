@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except SvgfError as error:
         fail(str(error))
     except KeyboardInterrupt:
-        terminal.tell("svgf-tune: interrupted before there was anything to go on from")
+        terminal.tell("svgf-tune: interrupted")
         sys.exit(130)
     sys.exit(code if isinstance(code, int) else 0)
 
