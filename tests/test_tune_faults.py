@@ -35,6 +35,18 @@ def test_references_are_like_their_frames_whatever_the_noise(shot):
     assert doubts("shot", found) == ()
 
 
+def test_fireflies_in_the_frames_say_nothing_about_their_targets(shot):
+    def struck(index):
+        frame, target = shot.read(index)
+        radiance = np.array(frame.radiance)
+        radiance[0, 20 * index + 3, 5:105:20] = 10.0 ** (2 + 8 * index)
+        return Example(frame._replace(radiance=radiance), target)
+
+    found = likeness(shot._replace(read=struck))
+    assert found.ratio == pytest.approx(1, abs=0.01)
+    assert doubts("s", found) == ()
+
+
 def noisy_again(shot):
     """The targets with independent noise as large as that of one sample a pixel."""
     rng = np.random.default_rng(0)

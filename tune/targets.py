@@ -10,12 +10,13 @@ from tune.shots import Shot
 
 BLOCK = 16  # pixels on a side: with one sample a pixel, 93 % and more of the variance of such means is the picture's
 # Four real sequences of one sample a pixel and their references: correlation .999 and more, slope .99 to 1.00, brightness 1.00.
-# References of other shots: correlation -.16 to .14; of the next frame .78 to .97, then displaced; gamma-encoded: slope .44 to .59.
+# References of other shots: correlation -.16 to .14; of the next frame .75 to .96, then displaced; gamma-encoded: slope .43 to .58.
 LEAST_CORRELATION = 0.9
 SLOPES = 0.75, 4 / 3
 RATIOS = 0.8, 1.25
 PEAK = 1.15  # displaced by one pixel they fit 1.37 to 1.49 times as well where they belong
 _BLOCKS, _RELIABLE = 64, 0.5  # with fewer, or mostly noise, or a picture without any contrast, nothing can be told
+_FEW = 0.25  # variance of a block's mean / mean^2, where its light is that of four pixels; fireflies are fewer
 _BOX = 4  # radius; what is wider than this box says little about where things are
 
 
@@ -25,7 +26,7 @@ class Likeness(NamedTuple):
     Attributes:
         correlation: of the logarithms of means over blocks of pixels, freed from what noise takes off; nan: cannot be told.
         slope: d log(target) / d log(frame) likewise: 1 where both are scene-linear, 1 / 2.2 for a target with that gamma.
-        ratio: mean of the targets / mean of the frames.
+        ratio: mean of the targets / mean of the frames, over the blocks whose light is not that of single bright pixels.
         displacement: (dx, dy), in whole pixels, by which the targets would have to move to fit best.
         frames_not_finite, targets_not_finite: pixels.
         unknown: why the correlation cannot be told; "" where it can.
@@ -42,7 +43,6 @@ class Likeness(NamedTuple):
 
 def likeness(shot: Shot) -> Likeness:
     """Read all frames and targets of a shot once, and compare them."""
-    sums = np.zeros(2)
     darkest, brightest = np.inf, -np.inf
     bad = [0, 0]
     means, noises, match = [], [], None
@@ -51,7 +51,6 @@ def likeness(shot: Shot) -> Likeness:
         bad = [count + int((~finite).sum()) for count, finite in zip(bad, known, strict=True)]
         both = known[0] & known[1]
         images = [np.where(both, image, 0.0) for image in (noisy, target)]
-        sums += [image.sum() for image in images]
         darkest, brightest = (
             pick(target, where=both, initial=so_far) for pick, so_far in ((np.min, darkest), (np.max, brightest))
         )
@@ -61,10 +60,12 @@ def likeness(shot: Shot) -> Likeness:
         match = _match(*images) + (0 if match is None else match)
     if match is None:
         return Likeness(np.nan, np.nan, np.nan, (0, 0), bad[0], bad[1])
-    correlation, slope, unknown = _related(np.concatenate(means, axis=1), np.concatenate(noises, axis=1))
+    known_means, known_noises = _known(np.concatenate(means, axis=1), np.concatenate(noises, axis=1))
+    correlation, slope, unknown = _related(known_means, known_noises)
     if unknown and brightest - darkest <= 1e-3 * abs(brightest):
         unknown = f"all pixels of the targets are {brightest:.3g}"
-    ratio = float(sums[1] / sums[0]) if sums[0] > 0 else np.nan
+    of_frames, of_targets = known_means.sum(axis=1)
+    ratio = float(of_targets / of_frames) if of_frames > 0 else np.nan
     return Likeness(correlation, slope, ratio, _displacement(match), bad[0], bad[1], unknown)
 
 
@@ -124,6 +125,12 @@ def _blocks(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return blocks.mean(axis=1), blocks.var(axis=1) / BLOCK**2
 
 
+def _known(means: np.ndarray, noises: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of the blocks in whose light no firefly outshines the rest, of frame and target."""
+    known = (noises <= _FEW * means**2).all(axis=0)
+    return means[:, known], noises[:, known]
+
+
 def _related(means: np.ndarray, noises: np.ndarray) -> tuple[float, float, str]:
     """Correlation and slope of the logarithms, with the share of noise (Spearman's correction for attenuation) taken out.
 
@@ -132,7 +139,11 @@ def _related(means: np.ndarray, noises: np.ndarray) -> tuple[float, float, str]:
     lit = (means > 1e-6).all(axis=0)
     if lit.sum() < _BLOCKS:
         size = f"{BLOCK} x {BLOCK} pixels"
-        return np.nan, np.nan, f"light is in {lit.sum()} blocks of {size} of both; wanted {_BLOCKS} or more"
+        return (
+            np.nan,
+            np.nan,
+            f"light is in {lit.sum()} blocks of {size} of both (fireflies left out); wanted {_BLOCKS} or more",
+        )
     logs = np.log(means[:, lit])
     total, noise = logs.var(axis=1), (noises[:, lit] / means[:, lit] ** 2).mean(axis=1)
     picture = total - noise
