@@ -21,8 +21,8 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
     negative ones stay. A non-finite normal, depth, albedo or position, or a depth beyond 2e17 (in float32): no surface. A
     normal that is not of unit length by more than 1 % is brought to it; one of zeros stays. A larger albedo than 2**20 counts
     as that, in dividing by it as in multiplying. A non-finite motion or prev_depth: no history. Guides read 0 where there is
-    no surface, the albedo 1. A measured variance that is not finite or negative becomes -1, unknown. A non-finite reflected
-    motion or depth: the reflection moves with the surface.
+    no surface, the albedo 1. A measured variance that is not finite or negative becomes -1, unknown. A non-finite
+    reflected motion or depth, or such a depth beyond 2e17: the reflection moves with the surface.
 
     Args:
         frame: one frame; shapes as in `Frame`.
@@ -31,7 +31,7 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
         The repaired frame and the counts of repaired pixels.
     """
     radiance_finite, emission_finite = jnp.isfinite(frame.radiance), jnp.isfinite(frame.emission)
-    radiance_positive = ~(frame.radiance < 0.0)
+    negative = radiance_finite & (frame.radiance < 0.0)
     radiance_bright = radiance_finite & (frame.radiance > _LARGEST_RADIANCE)
     was_surface = frame.object_id != -1
     guided = (
@@ -44,7 +44,7 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
     normal, unusual = _to_unit_length(jnp.where(surface[..., None], frame.normal, 0.0))
 
     repaired = Frame(
-        radiance=jnp.minimum(jnp.where(radiance_finite & radiance_positive, frame.radiance, 0.0), _LARGEST_RADIANCE),
+        radiance=jnp.minimum(jnp.where(radiance_finite & ~negative, frame.radiance, 0.0), _LARGEST_RADIANCE),
         albedo=jnp.where(surface[None, :, :, None], jnp.minimum(frame.albedo, _LARGEST_ALBEDO), 1.0),
         emission=jnp.where(emission_finite, frame.emission, 0.0),
         normal=normal,
@@ -58,7 +58,7 @@ def sanitise(frame: Frame) -> tuple[Frame, Rejected]:
     )
     rejected = Rejected(
         radiance=add_up(~radiance_finite.all(axis=(0, 3))),
-        negative=add_up(~radiance_positive.all(axis=(0, 3))),
+        negative=add_up(negative.any(axis=(0, 3))),
         emission=add_up(~emission_finite.all(axis=-1)),
         surface=add_up(was_surface & ~guided),
         motion=add_up(surface & ~traced),
@@ -89,14 +89,12 @@ def _to_unit_length(normal: Array) -> tuple[Array, Array]:
 
 
 def _reflections(frame: Frame, surface: Array) -> dict[str, Array]:
-    """What is not finite moves with the surface; a length that is not a number is that of this frame alone."""
+    """What is not finite, or too far, moves with the surface; a length that is not a number is that of this frame alone."""
     if frame.reflected_motion is None:
         return {}
     assert frame.reflected_prev_depth is not None  # `check_frame` saw to it: all three or none
     assert frame.longest_history is not None
-    traced = (
-        surface[None] & jnp.isfinite(frame.reflected_motion).all(axis=-1) & jnp.isfinite(frame.reflected_prev_depth)
-    )
+    traced = surface[None] & jnp.isfinite(frame.reflected_motion).all(axis=-1) & _usable(frame.reflected_prev_depth)
     longest = jnp.where(jnp.isfinite(frame.longest_history), frame.longest_history, 1.0)
     return {
         "reflected_motion": jnp.where(traced[..., None], frame.reflected_motion, _NOWHERE),

@@ -115,7 +115,7 @@ class Rejected(NamedTuple):
 
     Attributes:
         radiance: pixels with a non-finite radiance component (set to 0), over all signals.
-        negative: pixels with a negative radiance component (set to 0), over all signals.
+        negative: pixels with a finite negative radiance component (set to 0), over all signals.
         emission: pixels with a non-finite emission component (set to 0).
         surface: surface pixels dropped for a non-finite normal, depth or albedo.
         motion: surface pixels without history for a non-finite motion or prev_depth.

@@ -130,7 +130,7 @@ def check(frames: Frame, output: Output, *, albedo_floor: float = 1e-3, growth: 
         unusual = (np.abs(square - 1) > 0.02) & (np.abs(frames.normal).max(-1) > 1e-18)
     counted = {
         "radiance": ~np.isfinite(frames.radiance).all((1, 4)),
-        "negative": (frames.radiance < 0).any((1, 4)),
+        "negative": (np.isfinite(frames.radiance) & (frames.radiance < 0)).any((1, 4)),
         "bright": (np.isfinite(frames.radiance) & (frames.radiance > BRIGHTEST)).any((1, 4)),
         "emission": ~np.isfinite(frames.emission).all(-1),
         "surface": surface & ~guided,

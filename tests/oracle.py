@@ -87,7 +87,7 @@ def sanitise(frame):
         for x in range(width):
             radiance = frame["radiance"][:, y, x].reshape(-1).tolist()
             rejected["radiance"] += not all_finite(radiance)
-            rejected["negative"] += any(v < 0 for v in radiance)
+            rejected["negative"] += any(isfinite(v) and v < 0 for v in radiance)
             rejected["bright"] += any(isfinite(v) and v > 2.0**40 for v in radiance)
             repaired = [min(v, 2.0**40) if isfinite(v) and v > 0 else 0.0 for v in radiance]
             frame["radiance"][:, y, x] = np.reshape(repaired, (signals, 3))

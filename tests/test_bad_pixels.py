@@ -86,7 +86,7 @@ def test_the_history_recovers_within_its_window(run, kind):
 
 def test_what_was_repaired_is_counted(run):
     frames = wall(1)
-    frames[0]["radiance"][0, 0, 0] = np.nan
+    frames[0]["radiance"][0, 0, :3, 0] = np.nan, np.inf, -np.inf
     frames[0]["radiance"][1, 1, :3] = -1
     frames[0]["emission"][2, 2] = np.inf
     frames[0]["albedo"][0, 3, 3] = np.nan
@@ -94,7 +94,7 @@ def test_what_was_repaired_is_counted(run):
     frames[0]["normal"][5, :5] *= 3
     frames[0]["radiance"][1, 6, :4, 1] = 2e12
     counts = {name: int(count[0]) for name, count in run(stack(frames)).rejected._asdict().items()}
-    assert counts == {"radiance": 1, "negative": 3, "emission": 1, "surface": 1, "motion": 1, "normal": 5, "bright": 4}
+    assert counts == {"radiance": 3, "negative": 3, "emission": 1, "surface": 1, "motion": 1, "normal": 5, "bright": 4}
 
 
 @pytest.mark.parametrize("length", [1e-15, 0.5, 1.02, 40.0, 1e30])

@@ -330,10 +330,10 @@ MUTANTS = {
     ),
     # Sanitising and the whole
     "infinite radiance kept": mutant(
-        "sanitation", "radiance_finite & radiance_positive, frame", "~jnp.isnan(frame.radiance) & radiance_positive, frame",
+        "sanitation", "radiance_finite & ~negative, frame", "~jnp.isnan(frame.radiance) & ~negative, frame",
         "test_sanitise",
     ),
-    "negative radiance kept": mutant("sanitation", "radiance_finite & radiance_positive, frame", "radiance_finite, frame",
+    "negative radiance kept": mutant("sanitation", "radiance_finite & ~negative, frame", "radiance_finite, frame",
                                      "test_sanitise"),
     "NaN guides pass as valid": mutant("sanitation", "surface = was_surface & guided", "surface = was_surface", "test_sanitise"),
     "NaN motion passes as valid": mutant(

@@ -152,6 +152,22 @@ def test_a_history_not_worth_keeping_is_kept_shorter():
             np.testing.assert_allclose(got.moments[s, ..., which], wanted, rtol=1e-6, atol=1e-9)
 
 
+def test_a_reflection_that_is_nowhere_moves_with_its_surface():
+    depths = np.full((2, HEIGHT, WIDTH), 2.0)
+    depths[1, 0, :3] = np.nan, np.inf, 1e30
+    fields = {
+        "reflected_motion": np.zeros((*depths.shape, 2)),
+        "reflected_prev_depth": depths,
+        "longest_history": depths,
+    }
+    frame = bridge.to_frame({**scenes.flat(HEIGHT, WIDTH, signals=2), **fields}, np.float32)
+    clean, _ = jax.jit(sj.sanitise)(frame)
+    np.testing.assert_array_equal(clean.reflected_prev_depth == 0, depths != 2)
+    np.testing.assert_array_equal(
+        clean.reflected_motion != 0, np.broadcast_to(depths[..., None] != 2, (*depths.shape, 2))
+    )
+
+
 def test_files_with_hit_distances_give_frames_their_reflections(tmp_path):
     for t, eye in enumerate(EYES):
         depth, normal, ids, hit, wall = guides(eye)

@@ -58,7 +58,8 @@ def main() -> None:
     told("the references", shots)
     for count, brightness in ((1, 1e3), (1, 1e30), (20, 1e6)):
         told(
-            f"with fireflies in each frame: {count} of {brightness:g}", [with_fireflies(s, count, brightness) for s in shots]
+            f"with fireflies in each frame: {count} of {brightness:g}",
+            [with_fireflies(s, count, brightness) for s in shots],
         )
     told(
         "of another sequence",
