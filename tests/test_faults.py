@@ -13,8 +13,10 @@ from shots import init, step, write_frame, write_shot
 
 from svgf_jax import checkpoint, preview, streaming
 from svgf_jax.checkpoint import state_folder
+from svgf_jax.commands.denoise import _until_interrupted
 from svgf_jax.frames import open_source
 from svgf_jax.types import SvgfError
+from tune.command import _terminated_as_interrupted
 
 
 @pytest.fixture
@@ -262,6 +264,19 @@ def test_messages_that_nobody_reads_do_not_end_a_run():
 
 def test_a_terminal_that_is_closed_stops_the_run_after_its_frame():
     assert shell('"$@"', "-c", STOPPED) == (100 + signal.SIGHUP, "")
+
+
+def test_sigint_is_heard_where_scripts_start_commands_with_it_ignored():
+    """As `command &` in a script does."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with _until_interrupted() as received:
+            signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt), _terminated_as_interrupted():
+            signal.raise_signal(signal.SIGINT)
+        assert (received, signal.getsignal(signal.SIGINT)) == ([signal.SIGINT], signal.SIG_IGN)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 DRAWN = """

@@ -165,6 +165,19 @@ def test_worse_validation_can_be_accepted_a_lost_solver_not(
     assert left.value.code == code
 
 
+def test_an_interrupted_fit_says_its_doubts_again(shots, tmp_path, monkeypatch, capsys):
+    found = types.SimpleNamespace(result="interrupted", diverged=False)
+    monkeypatch.setattr("tune.fitting.fit", lambda *_, **__: found)
+    monkeypatch.setattr("tune.telling.conclude", lambda *_, **__: 0)
+    monkeypatch.setattr("tune.targets.with_doubts", lambda shot: shot._replace(notes=("of another shot?",)))
+    with pytest.raises(SystemExit) as left:
+        main([str(shots), "--reference", str(shots), "-o", str(tmp_path / "t.toml")])
+    assert left.value.code == 130
+    *_, doubt, last = capsys.readouterr().err.splitlines()
+    assert doubt == "warning: of another shot? (as said before the fit)"
+    assert "--resume" in last
+
+
 def test_a_fit_that_is_done_is_not_resumed(shots, tmp_path, capsys):
     (tmp_path / "t.toml").touch()
     with pytest.raises(SystemExit) as left:

@@ -233,11 +233,11 @@ def command(
         flip=flip,
         json=json,
     )
+    terminal.warn(f"{note} (as said before the fit)" for note in doubts if note not in opening)
     if _interrupted(found):
         terminal.tell(f"interrupted; go on with the same command and --resume ({checkpoint.name})")
         return 130
     checkpoint.unlink(missing_ok=True)
-    terminal.warn(f"{note} (as said before the fit)" for note in doubts if note not in opening)
     if found.diverged:
         return 1
     if code and accept:
@@ -317,13 +317,14 @@ def _interrupted(found: "Fit") -> bool:
 
 @contextmanager
 def _terminated_as_interrupted() -> Generator[None]:
-    """SIGTERM ends a fit as Ctrl-C does: with the best so far."""
+    """SIGTERM ends a fit as Ctrl-C does: with the best so far; and Ctrl-C where scripts start it in the background, too."""
 
     def on_signal(number: int, _: object) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, on_signal)
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
