@@ -2,8 +2,8 @@
 
 All of it lies in the *state folder* `OUT/.svgf-jax/`: `lock` (held by the operating system for as long as the process
 lives), `run.json` (what is being computed: parameters, inputs, options), `checkpoint.npz` (the history after so many
-frames) and `frames.jsonl` (a line for each frame that was done: its time, repairs, mean history length). The first three
-are replaced atomically, the last grows. They carry data only; nothing in them is ever executed.
+frames) and `frames.jsonl` (a line for each frame that was done: its time, repairs, mean history length). The two in the
+middle are replaced atomically, the last grows. They carry data only; nothing in them is ever executed.
 
 Several parts of one sequence may be written into one folder at a time: each has a state folder of its own in that one,
 `OUT/.svgf-jax/101-200/`.

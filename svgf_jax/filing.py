@@ -40,12 +40,33 @@ class FrameReport(NamedTuple):
     seconds: float = 0.0
 
 
-def read(source: frames.Source, plan: Plan, index: int) -> frames.LoadedFrame | None:
+class Work(NamedTuple):
+    """What all of these jobs are about.
+
+    Attributes:
+        source: what is read.
+        plan: what is written.
+        options: how.
+        provenance: attributes of the outputs.
+        on_output: called with each filtered frame and its output, NumPy arrays, before that is written.
+        still_locked: raises SvgfError once the output folder was removed; asked before anything is written into it.
+    """
+
+    source: frames.Source
+    plan: Plan
+    options: WriteOptions
+    provenance: Mapping[str, str]
+    on_output: Callable[[frames.LoadedFrame, Output], object] | None
+    still_locked: Callable[[], None]
+
+
+def read(work: Work, index: int) -> frames.LoadedFrame | None:
     """One frame. Of a file that was replaced since the run began, the new content counts, and the run's record says so."""
-    if source.sequence.files[index][1] is None:
+    plan = work.plan
+    if plan.files[index][1] is None:
         return None
     before = stamp_frame(plan, index)
-    item = frames.read_frame(source, index)
+    item = frames.read_frame(work.source, index)
     if stamp_frame(plan, index) != before:
         raise SvgfError(f"{item.path}: changed while it was read. Go on with --resume once it is complete.")
     if before != plan.identity["frames"][index]:
@@ -55,45 +76,37 @@ def read(source: frames.Source, plan: Plan, index: int) -> frames.LoadedFrame | 
         )
     if (np.asarray(item.frame.object_id) == -1).all():
         item = item._replace(notes=(*item.notes, "a frame without any surface: it passed through unfiltered"))
+    # The item lets go of its frame, so that `aligned` frees each array as it moves it.
     frame, item = list(item.frame), item._replace(frame=None)  # type: ignore[arg-type]
     return item._replace(frame=Frame(*memory.aligned(frame)))
 
 
-def write(
-    source: frames.Source,
-    plan: Plan,
-    options: WriteOptions,
-    provenance: Mapping[str, str],
-    on_output: Callable[[frames.LoadedFrame, Output], object] | None,
-    still_locked: Callable[[], None],
-    index: int,
-    item: frames.LoadedFrame,
-    output: Output,
-) -> FrameReport:
+def write(work: Work, index: int, item: frames.LoadedFrame, output: Output) -> FrameReport:
     """Bring one frame's output to the host and onto the disk. Runs in a background thread."""
-    path = plan.outputs[index]
+    number, path = work.plan.files[index][0], work.plan.outputs[index]
     if path is None:
-        return FrameReport(plan.files[index][0], "warm-up", None, {}, ())
+        return FrameReport(number, "warm-up", None, {}, ())
     output = to_host(output, item.path)
-    if on_output is not None:
-        on_output(item, output)
+    if work.on_output is not None:
+        work.on_output(item, output)
     image, clipped = outputs.compose(
-        output, item.image, options=options, signals=source.roles.signals, attributes=provenance
+        output, item.image, options=work.options, signals=work.source.roles.signals, attributes=work.provenance
     )
     notes = list(item.notes)
-    still_locked()
-    if dropped := outputs.write_frame(path, image, options=options):
+    work.still_locked()
+    if dropped := outputs.write_frame(path, image, options=work.options):
         notes.append(f"header attributes that could not be passed through: {', '.join(dropped)}")
     broken = int(np.count_nonzero(~np.isfinite(output.image).all(axis=-1)))
     rejected = {name: int(count) for name, count in output.rejected._asdict().items()}
     counts = Counter(item.counts) + Counter(rejected) + Counter(clipped=clipped, not_finite=broken)
     lengths = output.history_length[output.history_length > 0]
     history = float(np.mean(lengths)) if lengths.size else None
-    return FrameReport(plan.files[index][0], "filtered", path, dict(counts), tuple(notes), history)
+    return FrameReport(number, "filtered", path, dict(counts), tuple(notes), history)
 
 
-def fill_gap(plan: Plan, still_locked: Callable[[], None], index: int) -> FrameReport:
+def fill_gap(work: Work, index: int) -> FrameReport:
     """Stand in for a missing frame: the output before it again, or nothing. Runs once that output is complete."""
+    plan = work.plan
     number, path = plan.files[index][0], plan.outputs[index]
     if index < plan.warmup:
         return FrameReport(number, "warm-up", None, {}, ())
@@ -101,20 +114,21 @@ def fill_gap(plan: Plan, still_locked: Callable[[], None], index: int) -> FrameR
         return FrameReport(number, "skipped", None, {}, ())
     before = plan.outputs[index - 1]
     assert before is not None  # the first frame of a plan that holds is there
-    still_locked()
+    work.still_locked()
     for suffix in (".exr", ".png") if plan.png else (".exr",):
         preview.copy_file(before.with_suffix(suffix), path.with_suffix(suffix))
     return FrameReport(number, "held", path, {}, ())
 
 
-def save(plan: Plan, still_locked: Callable[[], None], state: Checkpoint) -> None:
+def save(work: Work, state: Checkpoint) -> None:
     """Keep the history. Runs in a background thread, once every output before is complete."""
-    still_locked()
-    checkpoint.save_checkpoint(plan.state, plan.identity, state)
+    work.still_locked()
+    checkpoint.save_checkpoint(work.plan.state, work.plan.identity, state)
 
 
-def pictures(plan: Plan, options: WriteOptions) -> Iterator[np.ndarray]:
+def pictures(work: Work) -> Iterator[np.ndarray]:
     """The outputs as 8-bit pictures, read back one at a time."""
-    for path in plan.outputs:
+    exposure, curve = work.options.exposure, work.options.tonemap
+    for path in work.plan.outputs:
         if path is not None:
-            yield preview.to_8bit(outputs.beauty(exr.read(path)), exposure=options.exposure, curve=options.tonemap)
+            yield preview.to_8bit(outputs.beauty(exr.read(path)), exposure=exposure, curve=curve)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from svgf_jax import __version__, checkpoint, filing, frames, outputs, preview, tonemapping
 from svgf_jax.checkpoint import Checkpoint
 from svgf_jax.compiled import Filters, Pipeline, check_devices, compile_filters, to_host, wait
-from svgf_jax.filing import FrameReport
+from svgf_jax.filing import FrameReport, Work
 from svgf_jax.methods import MethodConfig
 from svgf_jax.outputs import WriteOptions
 from svgf_jax.plan import Files, Plan, begin, check_there, locked, make_plan, stamp
@@ -143,13 +143,11 @@ def run(
         return made
 
     with locked(plan) as still_locked:
+        work = Work(source, plan, options, provenance, on_output, still_locked)
         start = begin(plan, resume=resume, overwrite=overwrite)
         end = len(plan.files)
         if start is not None:
-            read = partial(filing.read, source, plan)
-            write = partial(filing.write, source, plan, options, provenance, on_output, still_locked)
-            fill_gap = partial(filing.fill_gap, plan, still_locked)
-            save = partial(filing.save, plan, still_locked)
+            read = partial(filing.read, work)
             workers = threads if threads == 1 else 2 * threads  # one writes a frame before it reads the next
             with (
                 ThreadPoolExecutor(workers, thread_name_prefix="svgf-files") as pool,
@@ -158,25 +156,12 @@ def run(
                     read_ahead(read, range(start.next_index, end), threads=threads, pool=pool)
                 ) as loaded,
             ):
-                keep = on_output is not None
-                end = _filter(
-                    plan,
-                    start,
-                    loaded,
-                    filters,
-                    write,
-                    fill_gap,
-                    save,
-                    submit,
-                    stop,
-                    checkpoint_every,
-                    keep_frames=keep,
-                )
+                end = _filter(work, start, loaded, filters, submit, stop, checkpoint_every=checkpoint_every)
         if start is not None and end == len(plan.files):
             still_locked()
             check_there(plan, end, ending=True)
             if plan.video is not None:
-                preview.write_video(plan.video, filing.pictures(plan, options), fps=fps)
+                preview.write_video(plan.video, filing.pictures(work), fps=fps)
             checkpoint.save_run(plan.state, plan.identity, complete=True)
             checkpoint.remove_checkpoint(plan.state)
     return Summary(
@@ -227,26 +212,22 @@ def prepare(
 
 
 def _filter(
-    plan: Plan,
+    work: Work,
     start: Checkpoint,
     loaded: Iterator[frames.LoadedFrame | None],
     make_filters: Callable[[], Filters],
-    write: Callable[[int, frames.LoadedFrame, Output], FrameReport],
-    fill_gap: Callable[[int], FrameReport],
-    save_state: Callable[[Checkpoint], None],
     submit: Submit,
     stop: Callable[[], bool],
-    checkpoint_every: int,
     *,
-    keep_frames: bool,
+    checkpoint_every: int,
 ) -> int:
     """Filter frame after frame, leaving the writing to `submit`; how many of the sequence's frames are done then."""
-    history, filters = start.history, None
+    plan, history, filters = work.plan, start.history, None
 
     def save(index: int) -> None:
         # A copy: the next step takes the history's memory.
         kept = None if history is None else to_host(history, plan.files[index - 1][1] or "")
-        submit(partial(save_state, Checkpoint(index, kept)), after_all=True)
+        submit(partial(filing.save, work, Checkpoint(index, kept)), after_all=True)
 
     for index in range(start.next_index, len(plan.files)):
         try:
@@ -260,14 +241,14 @@ def _filter(
         if item is None:
             if not plan.hold:
                 history = None
-            submit(partial(fill_gap, index), after_all=True)
+            submit(partial(filing.fill_gap, work, index), after_all=True)
         else:
             filters = filters or make_filters()
             history, output = filters.step(filters.init(item.frame) if history is None else history, item.frame)
-            if not keep_frames:  # what is written needs only the input's other layers
+            if work.on_output is None:  # what is written needs only the input's other layers
                 item = item._replace(frame=None)  # type: ignore[arg-type]
             wait(output, item.path)  # before the next frame is read: frames take memory
-            submit(partial(write, index, item, output))
+            submit(partial(filing.write, work, index, item, output))
         if stop() and index + 1 < len(plan.files):
             save(index + 1)
             return index + 1

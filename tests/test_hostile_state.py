@@ -13,12 +13,13 @@ def test_a_missing_frame_is_not_held_in_a_folder_that_is_anothers_by_now(tmp_pat
     files = [(1, str(tmp_path / "a_1.exr")), (2, None)]
     plan = make_plan(files, tmp_path / "out", hold=True, png=False, video=False, identity={})
     with locked(plan) as still:
+        work = filing.Work(None, plan, None, {}, None, still)
         plan.outputs[0].touch()
-        assert filing.fill_gap(plan, still, 1).status == "held"
+        assert filing.fill_gap(work, 1).status == "held"
         plan.outputs[1].unlink()
         (plan.state / "lock").unlink()
         with pytest.raises(SvgfError, match="the output folder was removed"):
-            filing.fill_gap(plan, still, 1)
+            filing.fill_gap(work, 1)
     assert not plan.outputs[1].exists()
 
 
