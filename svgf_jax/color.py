@@ -33,7 +33,7 @@ def luminance_of_moments(color: tuple[Array, ...]) -> Array:
 def demodulate(radiance: Array, albedo: Array, *, albedo_floor: Array | float = 1e-3) -> Array:
     """Illumination: radiance / max(albedo, albedo_floor), per signal and channel.
 
-    The result is kept below the largest float / 2**12, so that sums of it stay finite.
+    The result is kept below the largest float / 2**12, so that sums of it stay finite; sanitised frames are far from it.
 
     Args:
         radiance: `[S, H, W, 3]`, finite, >= 0.
