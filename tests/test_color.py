@@ -31,5 +31,7 @@ def test_luminance_has_a_square_that_can_be_summed(dtype, most):
 def test_light_held_at_its_largest_does_not_change_with_the_albedo():
     """The derivative of min(r, most d) / d would be inf - inf."""
     radiance, albedo = (jnp.full((1, 2, 2, 3), value, jnp.float32) for value in (3e38, 1e-4))
-    loss = lambda floor: jnp.sum(1e3 * color.demodulate(radiance, albedo, albedo_floor=floor))  # noqa: E731
-    assert jax.grad(loss)(jnp.float32(1e-3)) == 0.0
+    loss = lambda floor, light: jnp.sum(1e3 * color.demodulate(light, albedo, albedo_floor=floor))  # noqa: E731
+    assert jax.grad(loss)(jnp.float32(1e-3), radiance) == 0.0
+    dim = jnp.full_like(radiance, 3.0)
+    assert jax.grad(loss)(jnp.float32(0.5), dim) == pytest.approx(-1e3 * 12 * 3 / 0.5**2)  # other light does

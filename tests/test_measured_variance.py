@@ -150,6 +150,9 @@ def test_a_frame_whose_variance_is_nowhere_known_counts_as_one_without(estimator
     unknown = frame._replace(variance=jnp.full((2, *SIZE), -1.0))
     np.testing.assert_allclose(estimate(unknown), estimate(frame), rtol=1e-12)
     assert estimate(frame)[:, frame.object_id != -1].min() > 0
+    y, x = np.argwhere((frame.object_id != -1) & (length < 3))[0]
+    one = estimate(frame._replace(variance=unknown.variance.at[:, y, x].set(1.0)))
+    np.testing.assert_allclose(one[:, y, x], pairs[:, y, x, 1] - first[:, y, x] ** 2)  # the only neighbour that counts
 
 
 @pytest.mark.parametrize("estimator", ["svgf", "spatial", "temporal"])

@@ -142,11 +142,14 @@ def test_a_history_not_worth_keeping_is_kept_shorter():
     longest = np.stack([np.full(shape[1:], n) for n in (1e6, 2.0, 1.0)])
     frame = bridge.to_frame({**scenes.flat(*shape[1:], signals=3), "longest_history": longest})
     light, old, moments = rng.gamma(1.0, 1.0, (*shape, 3)), rng.gamma(1.0, 1.0, (*shape, 3)), rng.random((*shape, 2))
-    previous = Reprojected(old, moments, np.full(shape[1:], 9.0), np.ones(shape[1:], bool))
+    valid = rng.random(shape[1:]) < 0.9
+    previous = Reprojected(old, moments, np.full(shape[1:], 9.0), valid)
     got = jax.jit(lambda *a: accumulate(*a, params=sj.Params()))(light, previous, frame)
     luma = light @ [0.2126, 0.7152, 0.0722]
-    for s, weight in enumerate((0.2, 0.5, 1.0)):
-        np.testing.assert_allclose(got.illumination[s], (1 - weight) * old[s] + weight * light[s], rtol=1e-6, atol=1e-9)
+    for s, most in enumerate((0.2, 0.5, 1.0)):
+        weight = np.where(valid, most, 1.0)
+        blended = (1 - weight[..., None]) * old[s] + weight[..., None] * light[s]
+        np.testing.assert_allclose(got.illumination[s], blended, rtol=1e-6, atol=1e-9)
         for which, new in enumerate((luma[s], luma[s] ** 2)):
             wanted = (1 - weight) * moments[s, ..., which] + weight * new
             np.testing.assert_allclose(got.moments[s, ..., which], wanted, rtol=1e-6, atol=1e-9)
