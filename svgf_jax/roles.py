@@ -222,11 +222,11 @@ def resolve_roles(
 
 
 def short_names(names: tuple[str, ...]) -> str:
-    """`Normal.XYZ` for Normal.X, Normal.Y and Normal.Z."""
-    stems = {name.rpartition(".")[0] for name in names}
-    if len(names) == 1 or len(stems) > 1 or "" in stems:
+    """`Normal.XYZ` for Normal.X, Normal.Y and Normal.Z; others as they are."""
+    stems, letters = {name.rpartition(".")[0] for name in names}, [name.rpartition(".")[2] for name in names]
+    if len(stems) > 1 or "" in stems or len(set(letters)) == 1 or max(map(len, letters)) > 1:
         return " ".join(names)
-    return f"{stems.pop()}.{''.join(name.rpartition('.')[2] for name in names)}"
+    return f"{stems.pop()}.{''.join(letters)}"
 
 
 def check_channels(layer: Layer, channels: Collection[str], *, where: str, role: str) -> None:

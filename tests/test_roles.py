@@ -5,7 +5,7 @@ import pytest
 
 from svgf_jax import SvgfError
 from svgf_jax.assembly import Place, assemble
-from svgf_jax.roles import WIDTH, Layer, Light, Roles, check_channels, resolve_roles
+from svgf_jax.roles import WIDTH, Layer, Light, Roles, check_channels, resolve_roles, short_names
 
 
 def rgb(*names):
@@ -14,6 +14,17 @@ def rgb(*names):
 
 NATIVE = [*rgb("direct", "indirect", "emission", "albedo"), "depth.Z", "motion.X", "motion.Y", "id.I"]
 NATIVE += [f"{name}.{c}" for name in ("normal", "position") for c in "XYZ"]
+
+
+def test_only_letters_of_one_layer_are_told_together():
+    for names, told in (
+        ("N.X N.Y N.Z", "N.XYZ"),
+        ("R G B", "R G B"),
+        ("a.R b.R", "a.R b.R"),
+        ("`.R `.R `.R", "`.R `.R `.R"),
+        ("svgf.valid svgf.change", "svgf.valid svgf.change"),
+    ):
+        assert short_names(tuple(names.split())) == told
 
 
 MEASURED = {"direct_variance", "indirect_variance", "radiance_variance"}
