@@ -345,6 +345,10 @@ class Worker:
             return {"by": "time, memory or crash", "seconds": None}
         return json.loads(answer)
 
+    def end(self):
+        self.writing.close()
+        self.process.wait()
+
 
 def key(mutant: dict) -> tuple:
     return tuple(mutant[name] for name in ("file", "kind", "line", "column", "is"))
@@ -377,6 +381,7 @@ def campaign(of_each: int, seed: int, log: Path, *, again: bool, only: list[str]
             answer = worker.ask({**mutant, "text": text})
             with log.open("a") as file:
                 file.write(json.dumps({**mutant, **answer}) + "\n")
+        worker.end()
 
 
 def tell(log: Path) -> None:
