@@ -47,6 +47,17 @@ def test_fireflies_in_the_frames_say_nothing_about_their_targets(shot):
     assert doubts("s", found) == ()
 
 
+def test_noise_that_is_mostly_fireflies_does_not_make_its_targets_look_brighter(shot):
+    def struck(index):
+        frame, target = shot.read(index)
+        light = target * np.random.default_rng(index).lognormal(-3.125, 2.5, (*target.shape[:2], 1))
+        return Example(frame._replace(radiance=light[None], emission=0 * frame.emission), target)
+
+    found = likeness(shot._replace(read=struck))
+    assert found.ratio == pytest.approx(1, abs=0.1)
+    assert doubts("s", found) == ()
+
+
 def noisy_again(shot):
     """The targets with independent noise as large as that of one sample a pixel."""
     rng = np.random.default_rng(0)

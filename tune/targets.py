@@ -26,7 +26,8 @@ class Likeness(NamedTuple):
     Attributes:
         correlation: of the logarithms of means over blocks of pixels, freed from what noise takes off; nan: cannot be told.
         slope: d log(target) / d log(frame) likewise: 1 where both are scene-linear, 1 / 2.2 for a target with that gamma.
-        ratio: mean of the targets / mean of the frames, over the blocks whose light is not that of single bright pixels.
+        ratio: mean of the targets / mean of the frames, with or without the blocks whose light is that of a few bright pixels,
+            whichever is nearer to 1: fireflies make it smaller, and leaving out what is real among them larger.
         displacement: (dx, dy), in whole pixels, by which the targets would have to move to fit best.
         frames_not_finite, targets_not_finite: pixels.
         unknown: why the correlation cannot be told; "" where it can.
@@ -60,12 +61,14 @@ def likeness(shot: Shot) -> Likeness:
         match = _match(*images) + (0 if match is None else match)
     if match is None:
         return Likeness(np.nan, np.nan, np.nan, (0, 0), bad[0], bad[1])
-    known_means, known_noises = _known(np.concatenate(means, axis=1), np.concatenate(noises, axis=1))
-    correlation, slope, unknown = _related(known_means, known_noises)
+    all_means, all_noises = np.concatenate(means, axis=1), np.concatenate(noises, axis=1)
+    known = (all_noises <= _FEW * all_means**2).all(axis=0)
+    correlation, slope, unknown = _related(all_means[:, known], all_noises[:, known])
     if unknown and brightest - darkest <= 1e-3 * abs(brightest):
         unknown = f"all pixels of the targets are {brightest:.3g}"
-    of_frames, of_targets = known_means.sum(axis=1)
-    ratio = float(of_targets / of_frames) if of_frames > 0 else np.nan
+    sums = [chosen.sum(axis=1) for chosen in (all_means, all_means[:, known])]
+    ratios = [float(target / frame) for frame, target in sums if frame > 0]
+    ratio = min(ratios, key=lambda one: max(one, 1 / max(one, 1e-30)), default=np.nan)
     return Likeness(correlation, slope, ratio, _displacement(match), bad[0], bad[1], unknown)
 
 
@@ -123,12 +126,6 @@ def _blocks(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     blocks = image[: height * BLOCK, : width * BLOCK].reshape(height, BLOCK, width, BLOCK).swapaxes(1, 2)
     blocks = blocks.reshape(-1, BLOCK**2)
     return blocks.mean(axis=1), blocks.var(axis=1) / BLOCK**2
-
-
-def _known(means: np.ndarray, noises: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the blocks in whose light no firefly outshines the rest, of frame and target."""
-    known = (noises <= _FEW * means**2).all(axis=0)
-    return means[:, known], noises[:, known]
 
 
 def _related(means: np.ndarray, noises: np.ndarray) -> tuple[float, float, str]:

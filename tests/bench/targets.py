@@ -43,6 +43,17 @@ def with_fireflies(shot: Shot, count: int, brightness: float) -> Shot:
     return shot._replace(read=read)
 
 
+def with_noise(shot: Shot) -> Shot:
+    """The targets times log-normal numbers of mean 1 in place of the frames."""
+
+    def read(index: int) -> Example:
+        frame, target = shot.read(index)
+        light = target * np.random.default_rng(index).lognormal(-3.125, 2.5, (*target.shape[:2], 1))
+        return Example(frame._replace(radiance=light[None], emission=0 * frame.emission), target)
+
+    return shot._replace(read=read)
+
+
 def told(name: str, shots: list[Shot]) -> None:
     """A row of the table."""
     found = [likeness(shot) for shot in shots]
@@ -61,6 +72,7 @@ def main() -> None:
             f"with fireflies in each frame: {count} of {brightness:g}",
             [with_fireflies(s, count, brightness) for s in shots],
         )
+    told("with noise of 22 times the light", [with_noise(shot) for shot in shots])
     told(
         "of another sequence",
         [with_targets(a, lambda t, i, b=b: b.read(i).target) for a in real for b in real if a is not b],
