@@ -153,6 +153,7 @@ def test_a_frame_whose_variance_is_nowhere_known_counts_as_one_without(estimator
     y, x = np.argwhere((frame.object_id != -1) & (length < 3))[0]
     one = estimate(frame._replace(variance=unknown.variance.at[:, y, x].set(1.0)))
     np.testing.assert_allclose(one[:, y, x], pairs[:, y, x, 1] - first[:, y, x] ** 2)  # the only neighbour that counts
+    assert np.isclose(one[0], one[0, y, x]).sum() > 1  # and what its neighbours take, however little it weighs there
 
 
 @pytest.mark.parametrize("estimator", ["svgf", "spatial", "temporal"])

@@ -212,11 +212,14 @@ def test_accumulate_as_chosen(choices):
 
 
 def test_accumulate():
-    c = case()
-    got = compiled(accumulation.accumulate, c.illumination, c.previous, c.frame, params=c.params)
+    c, go = case(), jax.jit(accumulation.accumulate)
+    got = go(c.illumination, c.previous, c.frame, params=c.params)
     assert_close(got.illumination, c.accumulated)
     assert_close(got.moments, c.moments)
     assert_close(got.history_length, c.length)
+    alone = go(c.illumination, c.previous, c.frame, params=to_params(PARAMS | {"max_history": 1.0}))
+    surface = np.array(c.surface)
+    assert_close(np.asarray(alone.illumination)[:, surface], np.asarray(c.illumination)[:, surface])
 
 
 def test_depth_gradient():

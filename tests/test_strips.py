@@ -58,7 +58,7 @@ def test_unrolled_taps_add_up_to_the_same(monkeypatch):
 
 def test_reading_outside_gives_the_nearest_pixel_and_says_so():
     plane = np.arange(12.0).reshape(3, 4)
-    row, column = np.array([0, -1, -9, 2, 3, 99, 1, 1, 1]), np.array([0, 0, -1, 3, 3, 4, -5, 4, 99])
+    row, column = np.array([0, -1, -9, 2, 3, 99, 1, 1, 1]), np.array([0, 0, -1, 3, 1, 4, -5, 4, 99])
     values, inside = sampling.read_at(jnp.asarray(plane), jnp.asarray(row), jnp.asarray(column))
     np.testing.assert_array_equal(inside, [True, False, False, True, False, False, False, False, False])
     np.testing.assert_array_equal(values, plane[np.clip(row, 0, 2), np.clip(column, 0, 3)])
