@@ -12,7 +12,7 @@ new light at once.
 
 s in [0, 1) is how significant the difference d of the mean luminances is against its own standard error e:
 s = max(0, 1 - (threshold e / d)^4), where e^2 is the variance of the samples' differences inside the neighbourhood over the
-effective number of them. A single firefly makes d and e large together: it is never significant at thresholds of 1.4 and more.
+effective number of them. A single firefly makes d and e large together: it is never significant at thresholds of 1.5 and more.
 Nor is it when there happens to be none: the variance is at least the one that the history remembers.
 
 Then, per pixel, from the four cells around it (bilinear, geometry weights): H' = max(0, g H + o), and the moments move with it:
@@ -42,11 +42,11 @@ from svgf_jax.sampling import (
 )
 from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
 
-GAIN_LEVELS = 3  # a-trous levels on the grid of cells: reach of +-14 cells
-OFFSET_LEVELS = 1  # +-2 cells
+GAIN_LEVELS = 4  # a-trous levels on the grid of cells: reach of +-15 cells
+OFFSET_LEVELS = 1  # +-1 cell
 LARGEST_GAIN = 50.0
-_OFFSETS = square_offsets(2)
-_B3 = np.array([1, 4, 6, 4, 1]) / 16.0  # the B3 spline
+_OFFSETS = square_offsets(1)
+_KERNEL = np.array([1, 2, 1]) / 4.0
 _DARK = 1e-6  # mean luminance below which a ratio means nothing
 _TINY = 1e-12
 
@@ -290,7 +290,7 @@ def _correct_sums(sums: tuple[Sums, ...], corrections: tuple[Correction, ...]) -
 
 def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, scalars: Params):
     """Sums over ever wider neighbourhoods of cells: of the weights, of their squares, and of `sums`."""
-    kernel = np.outer(_B3, _B3).reshape(-1)
+    kernel = np.outer(_KERNEL, _KERNEL).reshape(-1)
     away = jnp.asarray(_OFFSETS * size, cells.weight.dtype)
 
     def tap(sums, q, p, t):
@@ -314,7 +314,6 @@ def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, s
             offsets=_OFFSETS,
             per_tap=(distance[:, 0], distance[:, 1], jnp.asarray(np.log(kernel), away.dtype)),
             sums=jax.tree.map(lambda a: jnp.zeros((), a.dtype), state),
-            at_once=5,
             step_size=step_size,
             largest_step=2 ** (levels - 1),
         ), None
@@ -339,10 +338,10 @@ def shared_paths(levels: int) -> float:
     """
     whole = np.ones(1)
     for i in range(levels):
-        spread = np.zeros(4 * 2**i + 1)
-        spread[:: 2**i] = _B3
+        spread = np.zeros(2 * 2**i + 1)
+        spread[:: 2**i] = _KERNEL
         whole = np.convolve(whole, spread)
-    return float(((whole**2).sum() / (_B3**2).sum() ** levels) ** 2)  # squared: rows and columns
+    return float(((whole**2).sum() / (_KERNEL**2).sum() ** levels) ** 2)  # squared: rows and columns
 
 
 def _significance(

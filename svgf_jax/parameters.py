@@ -54,7 +54,7 @@ PRESETS: dict[str, tuple[Params, Config]] = {
     ),
     "adaptive": (
         Params(
-            alpha=0.3,
+            alpha=0.35,
             sigma_depth=0.6,
             sigma_normal=(4.0, 6.0, 32.0, 64.0, 32.0),
             sigma_luminance=(40.0, 10.0, 3.5, 2.5, 2.5),

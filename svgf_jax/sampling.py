@@ -154,7 +154,6 @@ def sum_over_taps(
     where: Array | None = None,
     step_size: int | Array = 1,
     largest_step: int = 1,
-    at_once: int | None = None,
     strip_rows: int | None = BY_WIDTH,
 ) -> Planes:
     """Run a stencil: for every pixel p, add up what `tap` makes of each neighbour q, then `finish` the sums.
@@ -173,7 +172,6 @@ def sum_over_taps(
         where: `[H, W]` bool; a strip without a True is not computed and its result is 0. None = everywhere.
         step_size: pixels per step, an integer; may be traced (a loop over levels then compiles once) unless strip_rows is None.
         largest_step: the largest value step_size may take.
-        at_once: taps per turn of the loop in a large picture (`unroll_taps`), None = all; in a small one it is one.
         strip_rows: rows per strip, `BY_WIDTH`; None = no strips and no loop, the plain form that the other is tested against.
 
     Returns:
@@ -191,7 +189,7 @@ def sum_over_taps(
 
     count, rows = split_rows(height, width, strip_rows)
     below = count * rows - height
-    unroll = (at_once or len(offsets)) if unroll_taps(height, width, len(offsets)) else 1
+    unroll = len(offsets) if unroll_taps(height, width, len(offsets)) else 1
     padded = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), add_margin(neighbours, top, left))
     centred = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), (centre, where))
     corners = jnp.asarray(offsets) * jnp.asarray(step_size, jnp.int32) + jnp.array([[top, left]], jnp.int32)

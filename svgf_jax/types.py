@@ -208,7 +208,7 @@ class Params(NamedTuple):
     reproject_normal: Any = 0.9
     kernel_near: Any = 2 / 3
     kernel_far: Any = 1 / 6
-    light_gain_threshold: Any = 1.4
+    light_gain_threshold: Any = 1.5
     light_offset_threshold: Any = 2.1
     light_sigma_normal: Any = 64.0
     initial_variance: Any = 100.0

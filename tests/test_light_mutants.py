@@ -219,8 +219,8 @@ CHECKS = {
         "new noise not added": ("second - first * first, 0.0), c.variance,", "second - first * first, 0.0), 0.0,"),
     },
     check_paths: {
-        "paths that never meet": (".sum() / (_B3**2).sum() ** levels) ** 2)", ".sum() / (whole**2).sum()) ** 2)"),
-        "paths that meet in rows alone": ("(_B3**2).sum() ** levels) ** 2)", "(_B3**2).sum() ** levels))"),
+        "paths that never meet": (".sum() / (_KERNEL**2).sum() ** levels) ** 2)", ".sum() / (whole**2).sum()) ** 2)"),
+        "paths that meet in rows alone": ("(_KERNEL**2).sum() ** levels) ** 2)", "(_KERNEL**2).sum() ** levels))"),
     },
     check_cells: {
         "centre at the upper left": ("plane[size // 2 :: size,", "plane[::size,"),

@@ -38,7 +38,7 @@ STRIPS: dict[str, tuple[str, dict, tuple]] = {  # parameter: (a sequence, "" = t
     "kernel_near": ("", {}, (0.0, 2 / 3, 1.0, 4.0)),
     "kernel_far": ("", {}, (0.0, 1 / 6, 0.5, 1.0)),
     "albedo_floor": ("gallery-pan", {}, (0.001, 0.03, 0.3, 1.0)),
-    "light_gain_threshold": ("lights-flicker", LIGHT, (0.0, 1.4, 5.0, 20.0)),
+    "light_gain_threshold": ("lights-flicker", LIGHT, (0.0, 1.5, 5.0, 20.0)),
     "light_offset_threshold": ("lights-flicker", LIGHT, (0.0, 2.1, 8.0, 50.0)),
     "light_sigma_normal": ("lights-flicker", LIGHT, (0.0, 4.0, 64.0, 1024.0)),
     "initial_variance": ("", {"variance": "temporal"}, (0.0, 0.01, 1.0, 100.0)),
