@@ -3,9 +3,9 @@
 Reprojection sees geometry only; when a lamp flickers or a shadow moves, the history shows light that is gone. A pixel's own
 sample can't tell: at one sample a pixel the noise is larger than the change. The mean over a neighbourhood on the same surface
 can. So the frame I and its reprojected history H are compared as means over *cells* of light_cell x light_cell pixels, pooled
-further by a-trous levels on the grid of cells, with the geometry weights w_z w_n and no luminance weight (noise averages out,
-change does not). The history is then corrected rather than shortened: it keeps its detail and its low noise, and takes on the
-new light at once.
+further by a-trous levels of 3 x 3 taps on the grid of cells, with the geometry weights w_z w_n and no luminance weight (noise
+averages out, change does not). The history is then corrected rather than shortened: it keeps its detail and its low noise, and
+takes on the new light at once.
 
 1. *Gain*, for lamps: over a wide neighbourhood, g = 1 + s (mean I / mean H - 1), per color channel.
 2. *Offset*, for shadows: what is left, over a narrow neighbourhood, o = s (mean I - g mean H).
@@ -46,7 +46,7 @@ GAIN_LEVELS = 4  # a-trous levels on the grid of cells: reach of +-15 cells
 OFFSET_LEVELS = 1  # +-1 cell
 LARGEST_GAIN = 50.0
 _OFFSETS = square_offsets(1)
-_KERNEL = np.array([1, 2, 1]) / 4.0
+_KERNEL = np.array([1, 2, 1]) / 4.0  # a third of the B3 spline's taps, and half its variance
 _DARK = 1e-6  # mean luminance below which a ratio means nothing
 _TINY = 1e-12
 
