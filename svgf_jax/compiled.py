@@ -13,8 +13,9 @@ from svgf_jax.types import Config, Frame, History, Output, SvgfError
 
 Result = TypeVar("Result")
 
-# Vectors as wide as the processor has them, not half as wide: a tenth of the time, the same bits.
-WIDE = {"xla_cpu_prefer_vector_width": 512}
+# The same bits, sooner and in less memory: vectors as wide as the processor has them, not half as wide (a tenth of the time), and
+# work in the order that holds least at once (a third to two fifths less of a step's own memory, 2 % of the time).
+LEAN = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 
 Pipeline = tuple[Callable[..., History], Callable[..., tuple[History, Output]]]  # init, step
 
@@ -122,16 +123,17 @@ def _jitted(
 
 @cache
 def compiler_options(platform: str) -> dict[str, Any]:
-    """What `jax.jit` is told for this kind of device ("cpu", "gpu"): `WIDE`, if its compiler knows it; nothing else for others."""
+    """What `jax.jit` is told for this kind of device ("cpu", "gpu"): of `LEAN` what its compiler knows; nothing for others."""
     import jax
 
-    if platform != "cpu":
-        return {}
-    try:
-        jax.jit(lambda a: a, compiler_options=WIDE).lower(np.float32(0)).compile()
-    except (RuntimeError, ValueError):  # a compiler of another year
-        return {}
-    return WIDE
+    def knows(option: dict[str, Any]) -> bool:
+        try:
+            jax.jit(lambda a: a, compiler_options=option).lower(np.float32(0)).compile()
+        except (RuntimeError, ValueError):  # a compiler of another year
+            return False
+        return True
+
+    return {name: value for name, value in LEAN.items() if platform == "cpu" and knows({name: value})}
 
 
 def _devices(name: str | None, count: int) -> tuple[Any, ...]:
