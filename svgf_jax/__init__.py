@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from svgf_jax.accumulation import Accumulated as Accumulated
     from svgf_jax.accumulation import accumulate as accumulate
     from svgf_jax.accumulation import clamp_history as clamp_history
+    from svgf_jax.adaptation import follow_light as follow_light
     from svgf_jax.antialiasing import taa as taa
     from svgf_jax.antialiasing import taa_init as taa_init
     from svgf_jax.arrays import frame_of as frame_of
@@ -79,6 +80,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "accumulation": ["Accumulated", "accumulate", "clamp_history"],
+    "adaptation": ["follow_light"],
     "antialiasing": ["taa", "taa_init"],
     "arrays": ["frame_of"],
     "atrous": ["atrous_filter", "atrous_level"],

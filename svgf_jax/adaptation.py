@@ -12,8 +12,9 @@ takes on the new light at once.
 
 s in [0, 1) is how significant the difference d of the mean luminances is against its own standard error e:
 s = max(0, 1 - (threshold e / d)^4), where e^2 is the variance of the samples' differences inside the neighbourhood over the
-effective number of them. A single firefly makes d and e large together: it is never significant at thresholds of 1.5 and more.
-Nor is it when there happens to be none: the variance is at least the one that the history remembers.
+effective number of them. A single firefly makes d and e large together: at thresholds of 1.5 and more it is never significant,
+but on a surface of one pixel. Nor is it when there happens to be none: the variance is at least the one that the history
+remembers.
 
 Then, per pixel, from the four cells around it (bilinear, geometry weights): H' = max(0, g H + o), and the moments move with it:
 M1' = g M1 + o; the variance M2 - M1^2 scales with the square of the light and turns, as s rises, into the one just observed.

@@ -31,6 +31,7 @@ def test_the_public_names_are_these():
             "reproject_reflections",
             "accumulate",
             "clamp_history",
+            "follow_light",
             "estimate_variance",
             "edge_weight",
         ),

@@ -117,7 +117,7 @@ def check_correction(module):
 
 
 def check_paths(module):
-    near([module.shared_paths(levels) for levels in (1, 2, 3)], [meetings(levels) for levels in (1, 2, 3)])
+    near([module.shared_paths(levels) for levels in (1, 2, 4)], [meetings(levels) for levels in (1, 2, 4)])
 
 
 def check_cells(module):

@@ -94,7 +94,8 @@ def measure(folder: Path, denoiser: Denoiser, frames: str | None, flip: bool) ->
             yield image, reference
 
     scores = [s for s in score_frames(pairs(), with_flip=flip) if s is not None]
-    return mean_scores(scores)._asdict() | {"seconds": float(np.median(seconds)), "frames": count}
+    known = {name: score for name, score in mean_scores(scores)._asdict().items() if np.isfinite(score)}
+    return known | {"seconds": float(np.median(seconds)), "frames": count}
 
 
 def table() -> None:
@@ -103,7 +104,9 @@ def table() -> None:
     for sequence, results in json.loads(RESULTS.read_text()).items():
         for name in denoisers():
             r = results[name]
-            errors = " | ".join(f"{r[key]:.4f}".lstrip("0") for key in ("relmse", "flip", "temporal"))
+            errors = " | ".join(
+                f"{r[key]:.4f}".lstrip("0") if key in r else "" for key in ("relmse", "flip", "temporal")
+            )
             print(f"| {sequence} | {name} | {r['psnr']:.2f} | {errors} | {r['seconds']:.2f} |")
 
 
