@@ -32,7 +32,7 @@ import numpy as np
 from jax.extend.core import jaxprs_in_params
 
 import svgf_jax as sj
-from svgf_jax import accumulation, adaptation, atrous, color, modulation, reprojection, variance
+from svgf_jax import accumulation, adaptation, antialiasing, atrous, color, modulation, reprojection, variance
 from svgf_jax.compiled import compiler_options
 from svgf_jax.edges import depth_gradient
 from svgf_jax.types import Config, Frame, Params
@@ -307,6 +307,10 @@ def bench_stages(height: int, width: int, rounds: int) -> list[str]:
             functools.partial(modulation.modulate, albedo_floor=jnp.float32(0.01)),
             (now.illumination, frame),
         ),
+        "taa (by choice)": (
+            functools.partial(antialiasing.taa, params=leaves),
+            (antialiasing.taa_init(frame.emission), frame.albedo[0], frame.motion, frame.depth),
+        ),
     }
     runs, least, work = {}, {}, {}
     for name, (function, args) in stages.items():
@@ -317,9 +321,8 @@ def bench_stages(height: int, width: int, rounds: int) -> list[str]:
     big = jnp.ones(2**26, jnp.float32)
     runs["copy"], _ = compiled(lambda a: a + jnp.float32(1), big)
     spent = take_turns(runs, rounds)
-    whole = sum(
-        wall for name, (wall, _) in spent.items() if name in stages and "follow" not in name and "7 x 7" not in name
-    )
+    beside = ("follow_light", "estimate_variance, 7 x 7", "taa")  # not in a step of `paper`
+    whole = sum(wall for name, (wall, _) in spent.items() if name in stages and not name.startswith(beside))
     bandwidth, peak = 2 * big.nbytes / spent.pop("copy")[0], most_operations()
     titles = (
         "stage",
