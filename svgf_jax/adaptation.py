@@ -47,7 +47,7 @@ GAIN_LEVELS = 4  # a-trous levels on the grid of cells: reach of +-15 cells
 OFFSET_LEVELS = 1  # +-1 cell
 LARGEST_GAIN = 50.0
 _OFFSETS = square_offsets(1)
-_KERNEL = np.array([1, 2, 1]) / 4.0  # a third of the B3 spline's taps, and half its variance
+_KERNEL = np.array([1, 2, 1]) / 4.0  # 9 taps to the B3 spline's 25, and half its variance
 _DARK = 1e-6  # mean luminance below which a ratio means nothing
 _TINY = 1e-12
 

@@ -45,6 +45,8 @@ def test_fireflies_in_the_frames_say_nothing_about_their_targets(shot):
     found = likeness(shot._replace(read=struck))
     assert found.ratio == pytest.approx(1, abs=0.01)
     assert doubts("s", found) == ()
+    brighter = likeness(changed(shot._replace(read=struck), lambda t, _: 2 * t))
+    assert brighter.ratio == pytest.approx(2, abs=0.02)  # nor do they hide it
 
 
 def test_noise_that_is_mostly_fireflies_does_not_make_its_targets_look_brighter(shot):

@@ -17,6 +17,7 @@ RATIOS = 0.8, 1.25
 PEAK = 1.15  # displaced by one pixel they fit 1.37 to 1.49 times as well where they belong
 _BLOCKS, _RELIABLE = 64, 0.5  # with fewer, or mostly noise, or a picture without any contrast, nothing can be told
 _FEW = 0.25  # variance of a block's mean / mean^2, where its light is that of four pixels; fireflies are fewer
+_RARE = 0.1  # share of such blocks up to which they are fireflies; more are the noise itself, without which the rest is too dark
 _BOX = 4  # radius; what is wider than this box says little about where things are
 
 
@@ -26,8 +27,8 @@ class Likeness(NamedTuple):
     Attributes:
         correlation: of the logarithms of means over blocks of pixels, freed from what noise takes off; nan: cannot be told.
         slope: d log(target) / d log(frame) likewise: 1 where both are scene-linear, 1 / 2.2 for a target with that gamma.
-        ratio: mean of the targets / mean of the frames, with or without the blocks whose light is that of a few bright pixels,
-            whichever is nearer to 1: fireflies make it smaller, and leaving out what is real among them larger.
+        ratio: mean of the targets / mean of the frames, without the blocks whose light is that of a few bright pixels where these
+            are rare.
         displacement: (dx, dy), in whole pixels, by which the targets would have to move to fit best.
         frames_not_finite, targets_not_finite: pixels.
         unknown: why the correlation cannot be told; "" where it can.
@@ -66,9 +67,8 @@ def likeness(shot: Shot) -> Likeness:
     correlation, slope, unknown = _related(all_means[:, known], all_noises[:, known])
     if unknown and brightest - darkest <= 1e-3 * abs(brightest):
         unknown = f"all pixels of the targets are {brightest:.3g}"
-    sums = [chosen.sum(axis=1) for chosen in (all_means, all_means[:, known])]
-    ratios = [float(target / frame) for frame, target in sums if frame > 0]
-    ratio = min(ratios, key=lambda one: max(one, 1 / max(one, 1e-30)), default=np.nan)
+    frame, target = (all_means[:, known] if known.mean() > 1 - _RARE else all_means).sum(axis=1)
+    ratio = float(target / frame) if frame > 0 else np.nan
     return Likeness(correlation, slope, ratio, _displacement(match), bad[0], bad[1], unknown)
 
 

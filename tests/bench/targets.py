@@ -73,6 +73,12 @@ def main() -> None:
             [with_fireflies(s, count, brightness) for s in shots],
         )
     told("with noise of 22 times the light", [with_noise(shot) for shot in shots])
+    twice = [with_targets(s, lambda t, i: 2 * t) for s in shots]
+    for count, brightness in ((0, 0), (1, 1e30), (20, 1e3), (20, 1e6)):
+        told(
+            f"twice as bright; fireflies: {count} of {brightness:g}",
+            [with_fireflies(s, count, brightness) for s in twice],
+        )
     told(
         "of another sequence",
         [with_targets(a, lambda t, i, b=b: b.read(i).target) for a in real for b in real if a is not b],
