@@ -49,6 +49,18 @@ def test_fireflies_in_the_frames_say_nothing_about_their_targets(shot):
     assert brighter.ratio == pytest.approx(2, abs=0.02)  # nor do they hide it
 
 
+def test_of_fireflies_everywhere_no_brightness_is_told(shot):
+    def struck(index):
+        frame, target = shot.read(index)
+        radiance = np.array(frame.radiance)
+        radiance[0, 8::32, 8::16] = 1e6
+        return Example(frame._replace(radiance=radiance), target)
+
+    found = likeness(shot._replace(read=struck))
+    assert np.isnan(found.ratio)
+    assert doubts("s", found) == ()
+
+
 def test_noise_that_is_mostly_fireflies_does_not_make_its_targets_look_brighter(shot):
     def struck(index):
         frame, target = shot.read(index)

@@ -28,7 +28,7 @@ class Likeness(NamedTuple):
         correlation: of the logarithms of means over blocks of pixels, freed from what noise takes off; nan: cannot be told.
         slope: d log(target) / d log(frame) likewise: 1 where both are scene-linear, 1 / 2.2 for a target with that gamma.
         ratio: mean of the targets / mean of the frames, without the blocks whose light is that of a few bright pixels where these
-            are rare.
+            are rare; nan: where they are not, but have most of the light.
         displacement: (dx, dy), in whole pixels, by which the targets would have to move to fit best.
         frames_not_finite, targets_not_finite: pixels.
         unknown: why the correlation cannot be told; "" where it can.
@@ -63,13 +63,24 @@ def likeness(shot: Shot) -> Likeness:
     if match is None:
         return Likeness(np.nan, np.nan, np.nan, (0, 0), bad[0], bad[1])
     all_means, all_noises = np.concatenate(means, axis=1), np.concatenate(noises, axis=1)
-    known = (all_noises <= _FEW * all_means**2).all(axis=0)
-    correlation, slope, unknown = _related(all_means[:, known], all_noises[:, known])
+    many = np.asarray((all_noises <= _FEW * all_means**2).all(axis=0))
+    correlation, slope, unknown = _related(all_means[:, many], all_noises[:, many])
     if unknown and brightest - darkest <= 1e-3 * abs(brightest):
         unknown = f"all pixels of the targets are {brightest:.3g}"
-    frame, target = (all_means[:, known] if known.mean() > 1 - _RARE else all_means).sum(axis=1)
-    ratio = float(target / frame) if frame > 0 else np.nan
-    return Likeness(correlation, slope, ratio, _displacement(match), bad[0], bad[1], unknown)
+    return Likeness(correlation, slope, _brightness(all_means, many), _displacement(match), bad[0], bad[1], unknown)
+
+
+def _brightness(means: np.ndarray, many: np.ndarray) -> float:
+    """Light of the targets / light of the frames, from their blocks `[2, n]`; nan: there is none, or fireflies decide it.
+
+    `many` `[n]`: whether a block's light is that of many pixels.
+    """
+    (frame, target), (rest, _) = sums = [chosen.sum(axis=1) for chosen in (means, means[:, many])]
+    if many.mean() >= 1 - _RARE:
+        frame, target = sums[1]
+    elif rest < frame / 2:
+        return np.nan
+    return float(target / frame) if frame > 0 else np.nan
 
 
 def doubts(name: str, found: Likeness) -> tuple[str, ...]:
