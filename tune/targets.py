@@ -75,11 +75,11 @@ def _brightness(means: np.ndarray, many: np.ndarray) -> float:
 
     `many` `[n]`: whether a block's light is that of many pixels.
     """
-    (frame, target), (rest, _) = sums = [chosen.sum(axis=1) for chosen in (means, means[:, many])]
-    if many.mean() >= 1 - _RARE:
-        frame, target = sums[1]
-    elif rest < frame / 2:
+    everything, rest = means.sum(axis=1), means[:, many].sum(axis=1)
+    rare = many.mean() >= 1 - _RARE
+    if not rare and rest[0] < everything[0] / 2:
         return np.nan
+    frame, target = rest if rare else everything
     return float(target / frame) if frame > 0 else np.nan
 
 
