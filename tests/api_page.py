@@ -18,17 +18,8 @@ GROUPS = {
     "svgf_jax": {
         "The filter": ["pipeline", "devices", "types", "parameters"],
         "Its stages": [
-            *(
-                "sanitation",
-                "color",
-                "outliers",
-                "reprojection",
-                "reflections",
-                "adaptation",
-                "accumulation",
-                "variance",
-            ),
-            *("edges", "atrous", "modulation", "antialiasing"),
+            *("sanitation", "color", "outliers", "reprojection", "reflections", "adaptation", "accumulation"),
+            *("variance", "edges", "atrous", "modulation", "antialiasing"),
         ],
         "Files and arrays": ["frames", "arrays", "references", "demo"],
         "Pictures": ["tonemapping"],
