@@ -15,6 +15,8 @@ from svgf_jax.sampling import BY_WIDTH, in_strips, planes, stack_planes
 from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
 from svgf_jax.windows import window_range
 
+_LEAST_WORTH = 1e-2  # frames; no history is noisier than a hundredth of one
+
 
 class Accumulated(NamedTuple):
     """Illumination `[S, H, W, 3]`, moments `[S, H, W, 2]` and history length `[H, W]` with this frame in; 0 without a surface."""
@@ -46,7 +48,7 @@ def accumulate(
 
     def blend(colors, previous_colors, previous_moments, previous_length, valid, surface, measured, longest):
         length = jnp.where(valid, jnp.minimum(previous_length + 1.0, scalars.max_history), 1.0)
-        least = 1.0 / jnp.maximum(length, 1.0) if config.warm_up else jnp.zeros_like(length)
+        least = _least_weight(length, config)
         weight = _blend_weight(scalars.alpha, least, valid)
         weight_moments = _blend_weight(scalars.alpha_moments, least, valid)
         if longest is not None:  # a shorter history is one that leans more on this frame
@@ -84,6 +86,42 @@ def accumulate(
         None if frame.longest_history is None else tuple(frame.longest_history),
     )
     return Accumulated(illumination=stack_planes(colors), moments=stack_planes(moments), history_length=length)
+
+
+def effective_history(
+    previous: Reprojected, history_length: Array, frame: Frame, *, params: Params, config: Config = Config()
+) -> Array | None:
+    """How many frames the accumulated illumination is worth by its noise: n = 1 / ((1 - a)^2 / prev_n + a^2), a as in `accumulate`.
+
+    A mean of n frames with equal weights has as much noise per pixel. What spatial filters take away, and the bilinear mean of
+    reprojection, is not counted, nor what a clamp does.
+
+    Args:
+        previous: the reprojected history; without an `effective_history` there is none here either.
+        history_length: `[H, W]`, the accumulated one.
+        frame: sanitised; its object_id and longest_history are read.
+        params: per-level leaves are read at entry 0.
+        config: its `warm_up` is read.
+
+    Returns:
+        `[S, H, W]`, n; 0 where there is no surface.
+    """
+    if previous.effective_history is None:
+        return None
+    alpha = at_level(params, 0).alpha
+
+    def count(signals, length, valid, surface, longest):
+        least = _least_weight(length, config)
+        weight = _blend_weight(alpha, least, valid)
+        weights = [weight for _ in signals] if longest is None else [jnp.maximum(weight, 1.0 / n) for n in longest]
+        noise = [(1.0 - a) ** 2 / jnp.maximum(n, _LEAST_WORTH) + a**2 for n, a in zip(signals, weights, strict=True)]
+        return tuple(jnp.where(surface, 1.0 / jnp.maximum(share, 1e-9), 0.0) for share in noise)
+
+    longest = None if frame.longest_history is None else tuple(frame.longest_history)
+    surface = frame.object_id != -1
+    return jnp.stack(
+        in_strips(count, tuple(previous.effective_history), history_length, previous.valid, surface, longest)
+    )
 
 
 def clamp_history(
@@ -147,6 +185,10 @@ def _measured_moment(
     past = jnp.maximum(previous[1] - previous[0] * previous[0], 0.0)
     measured = first * first + _blend(past, variance * ratio * ratio, weight)
     return jnp.where(variance >= 0.0, measured, second)
+
+
+def _least_weight(length: Array, config: Config) -> Array:
+    return 1.0 / jnp.maximum(length, 1.0) if config.warm_up else jnp.zeros_like(length)
 
 
 def _blend_weight(alpha: Array | float, least: Array, valid: Array) -> Array:

@@ -20,7 +20,10 @@ CELL_STRIP_PIXELS = 24576  # of a strip: larger ones cost fewer turns of the loo
 
 
 class Pixels(NamedTuple):
-    """What is compared, and what of each pixel says with whom: trees of planes; `known` is 1 where there is history."""
+    """What is compared, and what of each pixel says with whom: trees of planes.
+
+    `known` is 1 where there is history; `worth` is its effective length.
+    """
 
     guides: Guides
     slope: tuple[Array, Array]
@@ -28,6 +31,7 @@ class Pixels(NamedTuple):
     current: tuple[Color, ...]
     history: tuple[Color, ...]
     moments: tuple[tuple[Array, ...], ...]
+    worth: tuple[Array, ...] | None = None
 
 
 class Corner(NamedTuple):

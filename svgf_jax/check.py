@@ -68,6 +68,7 @@ def check_history(history: History, frame: Frame, config: Config) -> None:
         "depth": (height, width),
         "normal": (height, width, 3),
         "object_id": (height, width),
+        "effective_history": (signals, height, width),
     }
     if (history.taa is not None) != config.taa:
         raise SvgfError(

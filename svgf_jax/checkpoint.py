@@ -29,6 +29,7 @@ from svgf_jax.types import History, SvgfError, TaaHistory
 
 FOLDER = ".svgf-jax"
 FORMAT = 1  # of the files in FOLDER
+_ALWAYS = set(History._fields) - {"effective_history", "taa"}
 _MOST_TEXT = 2**28  # bytes; a million frames have less
 
 Identity = dict[str, Any]
@@ -223,7 +224,7 @@ def _unflat(entries: dict[str, Any]) -> History | None:
     arrays = {name: entries[name] for name in History._fields if name in entries and name != "taa"}
     if len(entries) != len(arrays) + len(taa) + 3 or (taa and not arrays):
         raise ValueError(f"it has {', '.join(sorted(entries))}")
-    if len(arrays) not in (0, len(History._fields) - 1) or len(taa) not in (0, len(TaaHistory._fields)):
+    if (arrays and not arrays.keys() >= _ALWAYS) or len(taa) not in (0, len(TaaHistory._fields)):
         raise ValueError("incomplete")
     if not arrays:
         return None
@@ -241,6 +242,7 @@ def _check_arrays(history: History) -> None:
         "illumination": (signals, height, width, 3),
         "moments": (signals, height, width, 2),
         "normal": (height, width, 3),
+        "effective_history": (signals, height, width),
         "taa.color": (height, width, 3),
         "taa.frames": (),
     }
@@ -251,7 +253,8 @@ def _check_arrays(history: History) -> None:
             raise ValueError(f"{name} is {array.dtype} {array.shape}")
         if not np.isfinite(array).all():
             raise ValueError(f"{name} is not finite")
-    if (history.history_length < 0).any() or (history.taa is not None and history.taa.frames < 0):
+    counts = (history.history_length, history.effective_history, history.taa and history.taa.frames)
+    if any(frames is not None and np.any(frames < 0) for frames in counts):
         raise ValueError("a history of fewer than 0 frames")
 
 

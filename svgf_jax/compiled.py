@@ -39,12 +39,14 @@ def compile_filters(
     pipeline: Pipeline | None,
     devices: int = 1,
     leave_out: tuple[str, ...] = (),
+    effective_history: bool = False,
 ) -> Filters:
     """The jitted filter with its parameters on the device.
 
     `device` is "cpu", "gpu:1", ..., None = JAX's default; `pipeline` is `(init, step)`, None = that of which `config` is;
     `devices`: so many of the kind share the rows of each frame (of SVGF only, see `check_devices`);
-    `leave_out` names fields of `Output` that nobody will read: they are None, and need no memory.
+    `leave_out` names fields of `Output` that nobody will read: they are None, and need no memory;
+    `effective_history`: of SVGF, keep it, as `svgf_jax.init` does.
     Raises SvgfError where there is no such device.
     """
     import jax
@@ -65,7 +67,8 @@ def compile_filters(
         from svgf_jax.devices import spread
 
         put = partial(spread, devices=chosen, config=cast(Config, config))  # `check_devices` saw to it
-    jitted_init, jitted_step = _jitted(init, step, config, leave_out, chosen)
+    asked = effective_history and pipeline is None and isinstance(config, Config)
+    jitted_init, jitted_step = _jitted(init, step, config, leave_out, chosen, asked)
     compiled = False
 
     def filtered(history: History, frame: Frame) -> tuple[History, Output]:
@@ -101,6 +104,7 @@ def _jitted(
     config: Config | MethodConfig,
     leave_out: tuple[str, ...],
     devices: tuple[Any, ...],
+    effective_history: bool,
 ) -> tuple[Callable[..., Any], Any]:
     """Compiled once a process, however many sequences it denoises."""
     import jax
@@ -110,9 +114,9 @@ def _jitted(
         from svgf_jax.devices import step_over
 
         step = partial(cast(Any, step_over), devices=devices)
-    start = (
-        partial(init, config=config) if getattr(config, "taa", False) else init
-    )  # other pipelines know nothing of it
+    start = init  # other pipelines know nothing of these
+    start = partial(start, config=config) if getattr(config, "taa", False) else start
+    start = partial(start, effective_history=True) if effective_history else start
 
     def go(history: History, frame: Frame, params: Any) -> tuple[History, Output]:
         history, output = step(history, frame, params=params, config=config)

@@ -21,7 +21,7 @@ from svgf_jax.types import Config, Frame, History, Output, Params, SvgfError
 
 _PER_SIGNAL = {  # `[S, H, ...]`; all others are `[H, ...]` or scalars
     *("radiance", "albedo", "variance", "reflected_motion", "reflected_prev_depth", "longest_history"),
-    *("illumination", "moments", "variance_filtered", "change"),
+    *("illumination", "moments", "variance_filtered", "change", "effective_history"),
 }
 
 

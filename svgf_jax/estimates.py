@@ -41,7 +41,7 @@ def estimate(scan: Scan, *, pixels: int, signals: int, config: Any, options: Wri
 
 def _disk(scan: Scan, pixels: int, signals: int, options: WriteOptions) -> float:
     """The input's own layers as they are compressed there, and the new ones as if they did not compress at all."""
-    planes = 3 + (signals + 2 if options.diagnostics else 0)
+    planes = 3 + (2 * signals + 2 if options.diagnostics else 0)
     frames = len(scan.there)
     own = 0.0 if options.only_denoised else scan.stored / max(frames, 1)
     return frames * (own + pixels * planes * (4 if options.full_float else 2) + (pixels if options.png else 0))

@@ -21,8 +21,8 @@ class WriteOptions(NamedTuple):
         full_float: the denoised R, G, B and diagnostics as 32-bit float; else 16-bit.
         compression: an EXR compression, by the name that `exr.write` knows.
         only_denoised: leave out the input's other layers and attributes.
-        diagnostics: add the layers `svgf.variance.*`, `svgf.change.*` (where the light is followed), `svgf.history_length`,
-            `svgf.valid`.
+        diagnostics: add the layers `svgf.variance.*`, `svgf.change.*` (where the light is followed), `svgf.effective_history.*`,
+            `svgf.history_length`, `svgf.valid`.
         png: also write a tone-mapped PNG beside each EXR.
         exposure: factor on the radiance in previews, > 0.
         tonemap: the tone curve of previews, a name of `tonemapping.CURVES`.
@@ -82,7 +82,7 @@ def compose(
     channels = {} if options.only_denoised else dict(source.channels)
     channels |= {name: plane(image[..., c]) for c, name in enumerate("RGB")}
     if options.diagnostics:
-        for layer in ("variance", "change"):
+        for layer in ("variance", "change", "effective_history"):
             for s, values in enumerate(() if (given := getattr(output, layer)) is None else np.asarray(given)):
                 channels[f"svgf.{layer}.{signals[s] if s < len(signals) else s}"] = plane(values)
         channels["svgf.history_length"] = plane(np.asarray(output.history_length))

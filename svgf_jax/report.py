@@ -22,7 +22,7 @@ from svgf_jax.page import Line, Shown
 from svgf_jax.plan import output_paths, part_name
 from svgf_jax.references import read_radiance, read_reference
 from svgf_jax.sequences import format_range
-from svgf_jax.shown import MOST, diagnostic_layers, diagnostics, encoded, legends, longest_history, share, shown_frame
+from svgf_jax.shown import MOST, diagnostic_layers, diagnostics, encoded, legends, share, shown_frame
 from svgf_jax.streaming import Summary
 from svgf_jax.types import Output
 
@@ -60,8 +60,8 @@ def watch(run: Run) -> Callable[[frames.LoadedFrame, Output], None]:
 
     def on_output(item: frames.LoadedFrame, output: Output) -> None:
         if item.number in chosen:
-            layers = (output.variance, output.history_length, output.valid, getattr(output, "change", None))
-            maps = diagnostics(*layers, longest=longest_history(run.params._asdict()))
+            layers = (output.variance, output.history_length, output.valid, output.change, output.effective_history)
+            maps = diagnostics(*layers, params=run.params._asdict())
             run.maps[item.number] = encoded(maps, share(len(chosen)))
 
     return on_output
@@ -157,7 +157,7 @@ def compare_page(
             attributes = {name: value for name, value in image.attributes.items() if name.startswith("svgf_jax:")}
             found = _recorded(attributes)
             target = read_radiance(pair.reference)
-            maps = diagnostic_layers(image, longest=longest_history(found.get("parameters", {})))
+            maps = diagnostic_layers(image, params=found.get("parameters", {}))
             pictures = {"result": read_radiance(pair.path)}
             if pair.number in before:
                 pictures = {"before": read_radiance(before[pair.number])} | pictures
@@ -280,7 +280,7 @@ def _run_frames(run: Run, done: Sequence[tuple[int, int, Path]]) -> tuple[list[S
                 pictures = {"denoised": result}
                 if run.source.sequence.files[index][1] is not None:
                     pictures = {"noisy": _noisy(frames.read_frame(run.source, index))} | pictures
-                maps = run.maps.get(number) or diagnostic_layers(image, longest=longest_history(run.params._asdict()))
+                maps = run.maps.get(number) or diagnostic_layers(image, params=run.params._asdict())
                 look = partial(shown_frame, exposure=run.options.exposure, curve=run.options.tonemap)
                 shown.append(look(number, pictures, target, {"denoised": maps}, len(chosen)))
             yield result, target

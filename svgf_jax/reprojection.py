@@ -43,8 +43,9 @@ def reproject(
     count, rows = (1, height) if strip_rows is None else split_rows(height, width, strip_rows)
     above, image_height = place(frame.depth)
     guides = whole({"id": history.object_id, "depth": history.depth, "normal": planes(history.normal)})
+    worth = None if history.effective_history is None else tuple(history.effective_history)
     values = (tuple(map(planes, history.illumination)), tuple(map(planes, history.moments)), history.history_length)
-    values = whole(values)
+    values = whole((*values, worth))
     current = {
         "id": frame.object_id,
         "depth": frame.prev_depth,
@@ -118,16 +119,22 @@ def reproject(
 
     strip = jax.checkpoint(strip, prevent_cse=False)  # type: ignore[assignment]
     result = lax.map(strip, jnp.arange(count, dtype=jnp.int32) * rows)
-    (illumination, moments, length), valid = jax.tree.map(lambda a: a.reshape(count * rows, width)[:height], result)
+    (illumination, moments, length, worth), valid = jax.tree.map(
+        lambda a: a.reshape(count * rows, width)[:height], result
+    )
     return Reprojected(
-        illumination=stack_planes(illumination), moments=stack_planes(moments), history_length=length, valid=valid
+        illumination=stack_planes(illumination),
+        moments=stack_planes(moments),
+        history_length=length,
+        valid=valid,
+        effective_history=None if worth is None else jnp.stack(worth),
     )
 
 
 def reproject_reflections(
     previous: Reprojected, history: History, frame: Frame, *, params: Params, config: Config = Config()
 ) -> Reprojected:
-    """Take from where their reflections were the illumination and moments of the signals that have any.
+    """Take from where their reflections were the illumination and moments of the signals that have any, and their worth.
 
     A signal's previous pixels are judged as in `reproject`, at the reflected motion. Where none is consistent, and in signals
     without reflections, the history stays that of the surface.
@@ -135,18 +142,20 @@ def reproject_reflections(
     if frame.reflected_motion is None:
         return previous
     assert frame.reflected_prev_depth is not None  # `check_frame` saw to it: all three or none
+    of_signals = ("illumination", "moments", *(() if history.effective_history is None else ("effective_history",)))
     signals = []
     for s in range(frame.radiance.shape[0]):
-        past = history._replace(illumination=history.illumination[s : s + 1], moments=history.moments[s : s + 1])
+        past = history._replace(**{name: getattr(history, name)[s : s + 1] for name in of_signals})
         seen = frame._replace(motion=frame.reflected_motion[s], prev_depth=frame.reflected_prev_depth[s])
         signals.append(reproject(past, seen, params=params, config=config))
 
     def choose(name: str) -> Array:
         reflected = jnp.concatenate([getattr(signal, name) for signal in signals])
         known = jnp.stack([signal.valid for signal in signals]) & previous.valid[None]
-        return jnp.where(known[..., None], reflected, getattr(previous, name))
+        known = known.reshape(*known.shape, *[1] * (reflected.ndim - known.ndim))
+        return jnp.where(known, reflected, getattr(previous, name))
 
-    return previous._replace(illumination=choose("illumination"), moments=choose("moments"))
+    return previous._replace(**{name: choose(name) for name in of_signals})
 
 
 def _position(motion: Array, first_row: Array, axis: int, extent: int) -> Array:

@@ -64,25 +64,32 @@ def _fitted(image: np.ndarray) -> np.ndarray:
     return squares.mean((1, 3))
 
 
-def diagnostics(variance: Any, length: Any, valid: Any, change: Any, *, longest: float) -> dict[str, np.ndarray]:
-    """The filter's own maps as pictures; what is None is not there. Several signals: variances add up, the largest change."""
+def diagnostics(
+    variance: Any, length: Any, valid: Any, change: Any, worth: Any, *, params: Mapping[str, Any]
+) -> dict[str, np.ndarray]:
+    """The filter's own maps as pictures; what is None is not there. `params` say how bright.
+
+    Several signals: variances add up, the largest change, the least effective history.
+    """
     found = {}
     with np.errstate(all="ignore"):
         if variance is not None:
             decades = np.log10(np.maximum(np.asarray(variance, np.float64).sum(0), 1e-30))
             found["variance"] = page.heat((decades + 6) / 7)
         if length is not None:
-            found["history length"] = page.heat(np.asarray(length, np.float64) / longest)
+            found["history length"] = page.heat(np.asarray(length, np.float64) / _longest(params))
         if valid is not None:
             found["history found"] = page.grey(np.asarray(valid, np.float64))
         if change is not None:
             signals = np.asarray(change, np.float64)
             largest = np.abs(signals).argmax(0)[None]
             found["change of light"] = page.signed(np.take_along_axis(signals, largest, axis=0)[0])
+        if worth is not None:
+            found["effective history"] = page.heat(np.asarray(worth, np.float64).min(0) / _most_worth(params))
     return found
 
 
-def diagnostic_layers(image: exr.Image, *, longest: float) -> dict[str, np.ndarray]:
+def diagnostic_layers(image: exr.Image, *, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """The same from the layers that `--diagnostics` adds to an output."""
 
     def stacked(prefix: str) -> np.ndarray | None:
@@ -90,12 +97,17 @@ def diagnostic_layers(image: exr.Image, *, longest: float) -> dict[str, np.ndarr
         return np.stack(planes) if planes else None
 
     length, valid = (image.channels.get(f"svgf.{name}") for name in ("history_length", "valid"))
-    return diagnostics(stacked("variance"), length, valid, stacked("change"), longest=longest)
+    return diagnostics(
+        stacked("variance"), length, valid, stacked("change"), stacked("effective_history"), params=params
+    )
 
 
 def legends(params: Mapping[str, Any] | None = None) -> dict[str, Legend]:
     """The maps, and what their colours mean."""
-    return _LEGENDS | {"history length": Legend(HEAT, "0", f"{longest_history(params or {}):g} frames")}
+    return _LEGENDS | {
+        "history length": Legend(HEAT, "0", f"{_longest(params or {}):g} frames"),
+        "effective history": Legend(HEAT, "0", f"worth {_most_worth(params or {}):.3g} frames"),
+    }
 
 
 def encoded(maps: Mapping[str, np.ndarray], most: int) -> dict[str, str]:
@@ -108,6 +120,12 @@ def share(count: int, pictures: int = 12) -> int:
     return BYTES // (max(count, 1) * pictures)
 
 
-def longest_history(params: Mapping[str, Any]) -> float:
-    """The longest history that there may be, for the scale of its map."""
+def _longest(params: Mapping[str, Any]) -> float:
+    """The longest history that there may be."""
     return float(np.max(params.get("max_history", 32.0)))
+
+
+def _most_worth(params: Mapping[str, Any]) -> float:
+    """How many frames a history is worth in the end, whose frames all weigh as much as the last."""
+    alpha = max(float(np.ravel(params.get("alpha", 0.2))[0]), 1 / _longest(params))
+    return (2 - alpha) / alpha

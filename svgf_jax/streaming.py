@@ -137,8 +137,16 @@ def run(
             on_frame(report)
 
     def filters() -> Filters:
-        leave_out = _NEVER_READ if options.diagnostics or on_output else _NEVER_READ + _DIAGNOSTICS
-        made = compile_filters(params, config, device=device, devices=devices, pipeline=pipeline, leave_out=leave_out)
+        looked_at = options.diagnostics or on_output is not None
+        made = compile_filters(
+            params,
+            config,
+            device=device,
+            devices=devices,
+            pipeline=pipeline,
+            leave_out=_NEVER_READ if looked_at else _NEVER_READ + _DIAGNOSTICS,
+            effective_history=looked_at,
+        )
         device_name.append(made.device)
         return made
 

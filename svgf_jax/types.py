@@ -80,6 +80,7 @@ class History(NamedTuple):
         moments: `[S, H, W, 2]`, accumulated first and second moment of the illumination's luminance.
         history_length: `[H, W]`, frames accumulated, a real number in [0, max_history]; 0 = no history.
         depth, normal, object_id: the sanitised guides of the frame that this history ends with.
+        effective_history: `[S, H, W]`, as in `Output`; None = not kept; `init` is asked for it.
         taa: what temporal anti-aliasing remembers; None where `Config.taa` is off.
     """
 
@@ -89,6 +90,7 @@ class History(NamedTuple):
     depth: Array
     normal: Array
     object_id: Array
+    effective_history: Array | None = None
     taa: TaaHistory | None = None
 
 
@@ -100,6 +102,7 @@ class Reprojected(NamedTuple):
         moments: `[S, H, W, 2]`.
         history_length: `[H, W]`, a real number.
         valid: `[H, W]` bool, whether there is history.
+        effective_history: `[S, H, W]`, as in `Output`.
         change: `[S, H, W]`, as in `Output`.
     """
 
@@ -107,6 +110,7 @@ class Reprojected(NamedTuple):
     moments: Array
     history_length: Array
     valid: Array
+    effective_history: Array | None = None
     change: Array | None = None
 
 
@@ -146,6 +150,9 @@ class Output(NamedTuple):
         display: `[H, W, 3]`, the anti-aliased image on its tone curve, c / (1 + luma); None where `Config.taa` is off.
         change: `[S, H, W]`, by how much the history's luminance was corrected to this frame's light, as a share of the brighter
             of the two: 0.5 = doubled, -0.9 = a tenth of it is left, 0 = as it was; None where `Config.light_cell` is 0.
+        effective_history: `[S, H, W]`, how many frames the accumulated illumination is worth: the mean of so many frames of
+            this one's light has its noise per pixel, spatial filters left out; 0 where there is no surface; None where the
+            history has none.
     """
 
     image: Array
@@ -157,6 +164,7 @@ class Output(NamedTuple):
     rejected: Rejected
     display: Array | None = None
     change: Array | None = None
+    effective_history: Array | None = None
 
 
 class Params(NamedTuple):

@@ -104,7 +104,7 @@ def steps(name, count, size, *, frames=3, signals=1, changes=()):
     params = type(params)(*(value[: config.levels] if value.ndim else value for value in values))
     sequence = [to_frame(frame, np.float32) for frame in scenes.synthetic(3, *size, frames=frames)]
     sequence = [f._replace(radiance=f.radiance[:signals]) for f in sequence]
-    one = several = init(sequence[0], config=config)
+    one = several = init(sequence[0], config=config, effective_history=True)
     worst = 0.0
     for frame in sequence:
         one = step(one, frame, params=params, config=config)

@@ -11,7 +11,7 @@ import pytest
 import scenes
 
 import svgf_jax as sj
-from svgf_jax import adaptation, exr
+from svgf_jax import exr, significance
 from svgf_jax.adaptation import follow_light
 from svgf_jax.color import demodulate
 from svgf_jax.edges import Guides
@@ -66,6 +66,7 @@ def follow_light_by_loops(previous, illumination, frame, params, size):
     cells = [(i, j) for i in range(rows) for j in range(columns) if inside(centre((i, j)))]
     out = {k: np.array(v) for k, v in previous.items() if k != "change"}
     out["change"] = np.zeros(illumination.shape[:3])
+    worth = out["effective_history"]
     for signal in range(len(illumination)):
         current, history = illumination[signal], previous["illumination"][signal]
         # Sums over each cell's own pixels: weight, weight^2, and the weighted samples themselves.
@@ -111,7 +112,7 @@ def follow_light_by_loops(previous, illumination, frame, params, size):
                 for cell, t in state.items()
             }
 
-        def significance(i, h, square, share, threshold):
+        def significant(i, h, square, share, threshold):
             change = (i @ LUMINANCE - h @ LUMINANCE) ** 2
             variance = max(0.0, square[0] - change)
             noise = threshold**2 * share * max(variance, square[1])
@@ -121,26 +122,28 @@ def follow_light_by_loops(previous, illumination, frame, params, size):
             return 1 + s * (np.clip((i + 0.01 * scale) / (h + 0.01 * scale), 1 / 50, 50) - 1) if scale > 1e-6 else 1.0
 
         gain, luminance_gain = {c: np.ones(3) for c in cells}, dict.fromkeys(cells, 1.0)
-        surely, corrections = {}, {}
+        surely, corrections, added = {}, {}, {}
         for cell, (i, h, square, share) in pooled(4, gain, luminance_gain).items():
-            s, _ = significance(i, h, square, share, params.light_gain_threshold)
+            s, _ = significant(i, h, square, share, params.light_gain_threshold)
             scale = h @ LUMINANCE
             gain[cell] = np.array([ratio(a, b, scale, s) for a, b in zip(i, h, strict=True)])
             luminance_gain[cell] = ratio(i @ LUMINANCE, scale, scale, s)
-            surely[cell] = s
+            surely[cell], added[cell] = s, s**2 * share
         for cell, (i, h, square, share) in pooled(1, gain, luminance_gain).items():
-            s, variance = significance(i, h, square, share, params.light_offset_threshold)
+            s, variance = significant(i, h, square, share, params.light_offset_threshold)
             grown = ratio(i @ LUMINANCE, h @ LUMINANCE, h @ LUMINANCE, s)
             keep = (1 - surely[cell]) * (1 - s) * (luminance_gain[cell] * grown) ** 2
             new = (1 - (1 - surely[cell]) * (1 - s)) * variance
-            corrections[cell] = np.array([*gain[cell], *(s * (i - h)), luminance_gain[cell], keep, new])
+            dimmed = max(1, 1 / grown) ** 2
+            noise = [dimmed, dimmed * added[cell] + s**2 * share]
+            corrections[cell] = np.array([*gain[cell], *(s * (i - h)), luminance_gain[cell], keep, new, *noise])
 
         known = {c for c in cells if sum(w for w, *_ in sums[c]) > 1e-12}
         for y in range(height):
             for x in range(width):
                 at = ((y - size // 2) / size, (x - size // 2) / size)
                 corner = (int(np.floor(at[0])), int(np.floor(at[1])))
-                total, weights = np.zeros(9), 0.0
+                total, weights = np.zeros(11), 0.0
                 for dy in (0, 1):
                     for dx in (0, 1):
                         q = (corner[0] + dy, corner[1] + dx)
@@ -158,6 +161,7 @@ def follow_light_by_loops(previous, illumination, frame, params, size):
                 variance = c[7] * max(0, m2 - m1**2) + c[8]
                 m1 = max(0, c[6] * m1 + c[3:6] @ LUMINANCE)
                 out["moments"][signal, y, x] = m1, variance + m1**2
+                worth[signal, y, x] = 1 / (c[9] / worth[signal, y, x] + c[10])
     return out
 
 
@@ -192,6 +196,7 @@ def test_the_stage_is_what_its_docstring_says(size):
         depth=frames[0]["depth"],
         normal=frames[0]["normal"],
         object_id=np.asarray(frames[0]["object_id"], np.int32),
+        effective_history=rng.uniform(1.0, 5.0, (2, 22, 19)),
     )
     illumination = demodulate(frame.radiance, frame.albedo)
     illumination = illumination.at[1].multiply(4.0)  # a change beyond the scene's own
@@ -209,7 +214,8 @@ def test_the_stage_is_what_its_docstring_says(size):
     )
     assert np.abs(wanted["illumination"] - np.asarray(previous.illumination)).max() > 0.1
     assert 0.5 < np.abs(wanted["change"]).max() <= 1.0
-    for name in ("illumination", "moments", "change"):
+    assert (wanted["effective_history"] < 0.9 * np.asarray(previous.effective_history)).any()
+    for name in ("illumination", "moments", "change", "effective_history"):
         np.testing.assert_allclose(np.asarray(getattr(got, name)), wanted[name], rtol=1e-9, atol=1e-9)
 
 
@@ -244,7 +250,7 @@ def lit(rng, noise: str, samples: int, factor: float):
 def steady(noise: str, samples: int, config: Config = WALL):
     """The history of a wall of luminance 1 after `STEADY` frames."""
     rng = np.random.default_rng(7)
-    history = sj.init(lit(rng, noise, samples, 1.0))
+    history = sj.init(lit(rng, noise, samples, 1.0), effective_history=True)
     for _ in range(STEADY):
         history, _ = bridge.jitted_step(config)(history, lit(rng, noise, samples, 1.0), params=WALL_PARAMS)
     return history
@@ -266,11 +272,12 @@ def test_a_step_of_the_light_is_followed_at_once(noise, samples, factor):
 @pytest.mark.parametrize("noise", list(NOISES))
 @pytest.mark.parametrize("samples", [1, 2, 4])
 def test_steady_noise_is_not_taken_for_change(noise, samples):
-    """By its variance the history is nearly as long as without the stage."""
-    configs = (WALL, WALL._replace(light_cell=0))
-    with_stage, without = (np.asarray(steady(noise, samples, c).illumination[0, ..., 1]) for c in configs)
-    assert without.var() / with_stage.var() > 0.9
-    assert abs(with_stage.mean() - 1.0) < 0.03
+    """By its variance the history is worth nearly as much as without the stage, and by the corrections' own count."""
+    with_stage, without = (steady(noise, samples, config) for config in (WALL, WALL._replace(light_cell=0)))
+    light = np.asarray(with_stage.illumination[0, ..., 1])
+    assert np.asarray(without.illumination[0, ..., 1]).var() / light.var() > 0.9
+    assert abs(light.mean() - 1.0) < 0.03
+    assert (1 / without.effective_history).mean() / (1 / with_stage.effective_history).mean() > 0.97
 
 
 def test_step_by_step_and_scan_agree_to_the_bit_and_bad_pixels_stay_out():
@@ -278,11 +285,11 @@ def test_step_by_step_and_scan_agree_to_the_bit_and_bad_pixels_stay_out():
     frames = bridge.to_frames(scenes.synthetic(3, 29, 34, frames=3, signals=1, dirty=True), np.float32)
     lean = {"levels": 0, "variance": "temporal", "fallback": False, "reprojection": "nearest"}  # quick to compile
     config, params = Config(light_cell=4, **lean), Params()
-    _, scanned = bridge.jitted_denoise(config, compiling.AS_USERS)(frames, params=params)
-    history = None
+    start = sj.init(jax.tree.map(lambda leaf: leaf[0], frames), effective_history=True)
+    _, scanned = bridge.jitted_denoise(config, compiling.AS_USERS)(frames, history=start, params=params)
+    history = start
     for t in range(3):
         frame = jax.tree.map(lambda leaf, t=t: leaf[t], frames)
-        history = sj.init(frame) if history is None else history
         history, output = bridge.jitted_step(config, compiling.AS_USERS)(history, frame, params=params)
         jax.tree.map(lambda a, b, t=t: np.testing.assert_array_equal(a, b[t]), output, scanned)
         assert all(np.isfinite(a).all() for a in (output.illumination, output.change, history.moments))
@@ -363,13 +370,13 @@ def test_the_effective_number_is_that_of_the_errors_seen(levels):
     size, trials = 37, 600
     plane = lambda value: jnp.full((size, size), value)  # noqa: E731
     guides = Guides(plane(2.0), (plane(0.0), plane(0.0), plane(-1.0)), plane(1.0))
-    cells = adaptation.Cells(guides, (plane(0.0), plane(0.0)), plane(1.0), plane(1.0))
+    cells = significance.Cells(guides, (plane(0.0), plane(0.0)), plane(1.0), plane(1.0))
 
     def pooled(noise):
         color = (noise,) * 3
-        sums = (adaptation.Compared(color, color, noise, noise),)
-        totals = adaptation._pool(cells, sums, levels=levels, size=4, scalars=at_level(PARAMS, 0))
-        effective, (mean,) = adaptation._means(*totals, levels=levels)
+        sums = (significance.Compared(color, color, noise, noise),)
+        totals = significance._pool(cells, sums, levels=levels, size=4, scalars=at_level(PARAMS, 0))
+        effective, (mean,) = significance._means(*totals, levels=levels)
         return effective[size // 2, size // 2], mean.current[0][size // 2, size // 2]
 
     noise = np.random.default_rng(6).normal(size=(trials, size, size))

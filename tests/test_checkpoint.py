@@ -33,14 +33,18 @@ def out(tmp_path):
 TAA = TaaHistory(RNG.random((4, 5, 3), np.float32), np.float32(3))
 
 
-@pytest.mark.parametrize("wanted", [HISTORY, HISTORY._replace(taa=TAA)], ids=["plain", "anti-aliased"])
+FULL = HISTORY._replace(taa=TAA, effective_history=RNG.random((2, 4, 5), np.float32))
+
+
+@pytest.mark.parametrize("wanted", [HISTORY, FULL], ids=["plain", "with all there may be"])
 def test_round_trip_is_exact(out, wanted):
     checkpoint.save_checkpoint(state_folder(out), IDENTITY, Checkpoint(1, wanted))
     index, history = checkpoint.load_checkpoint(state_folder(out), IDENTITY)
     assert index == 1
     assert type(history.taa) is type(wanted.taa)
     for saved, loaded in zip((*wanted[:-1], *(wanted.taa or ())), (*history[:-1], *(history.taa or ())), strict=True):
-        assert saved.dtype == loaded.dtype
+        assert (saved is None) == (loaded is None)
+        assert saved is None or saved.dtype == loaded.dtype
         np.testing.assert_array_equal(saved, loaded)
 
 
@@ -131,6 +135,8 @@ NUMBERS = {  # what may be wrong in a file that is whole
     "taa: without its count": {"taa.color": TAA.color},
     "taa: NaN": {"taa.color": TAA.color, "taa.frames": np.float32(np.nan)},
     "taa: count of less than none": {"taa.color": TAA.color, "taa.frames": np.float32(-1)},
+    "effective_history: of one signal": {"effective_history": FULL.effective_history[:1]},
+    "effective_history: negative": {"effective_history": -FULL.effective_history},
     "another name": {"more": np.float32(1)},
     "next_index: a list": {"next_index": np.array([1])},
     "next_index: real": {"next_index": np.float64(1.5)},
@@ -144,7 +150,7 @@ NUMBERS = {  # what may be wrong in a file that is whole
 def test_numbers_that_no_run_leaves_are_refused(out, what):
     identity = np.frombuffer(json.dumps(IDENTITY).encode(), np.uint8)
     whole = HISTORY._asdict() | {"format": np.array(1), "next_index": np.array(1), "identity": identity}
-    del whole["taa"]
+    del whole["taa"], whole["effective_history"]
     path = state_folder(out) / "checkpoint.npz"
     np.savez(path, **whole)
     assert checkpoint.load_checkpoint(state_folder(out), IDENTITY).next_index == 1

@@ -58,6 +58,7 @@ def test_denoise_writes_frames_and_tells_what_it_does(denoised, shots):
     image = exr.read(out / "shot.0003.exr")
     assert image.channels["R"].dtype == np.float32
     assert image.channels["svgf.history_length"].max() == 3
+    assert image.channels["svgf.effective_history.direct"].max() == pytest.approx(3)  # they weigh the same
     assert image.attributes["svgf_jax:preset"] == "falcor sigma_normal=64 levels=2"
 
 

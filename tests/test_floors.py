@@ -26,6 +26,7 @@ FLOORS = [
         "warping",
     },
     {"renderers", "cells"},
+    {"significance"},
     {"variance", "atrous", "adaptation", "roles", "reflections", "preview", "joint_bilateral", "outliers", "matrices"},
     {"advising", "planes", "camera_files", "geometry"},
     {"assembly"},

@@ -13,9 +13,10 @@ from test_adaptation import LUMINANCE, meetings
 
 import svgf_jax
 from svgf_jax import adaptation, cells, reflections
+from svgf_jax import significance as judging
 from svgf_jax.edges import Guides
 
-MODULES = {"adaptation": adaptation, "cells": cells, "reflections": reflections}
+MODULES = {"adaptation": adaptation, "cells": cells, "reflections": reflections, "significance": judging}
 RNG = np.random.default_rng(3)  # begun anew for each check
 
 
@@ -69,9 +70,9 @@ def check_sums(module):
     current, history, gain = planes(9), planes(9), (1.5, 0.5, 2.0)
     first, second = RNG.gamma(1.0, 1.0, (2, 9))
     second = second + first**2 * np.array([1.0] * 8 + [0.0])
-    found = module._compare(current, history, (first, second))
+    found = module.compare(current, history, (first, second))
     sums = module.Sums(*(tuple(c.sum() for c in f) if isinstance(f, tuple) else f.sum() for f in found))
-    (got,) = module._correct_sums((sums,), (module.Correction(gain, (0.0,) * 3, 1.25, 1.0, 0.0),))
+    (got,) = module._correct_sums((sums,), (module.Gain(gain, 1.25, 1.0, 0.0),))
     near(got.current, [c.sum() for c in current])
     near(got.previous, [g * c.sum() for g, c in zip(gain, history, strict=True)])
     near(got.square, ((luma(current) - 1.25 * luma(history)) ** 2).sum())
@@ -91,13 +92,17 @@ def check_gain_then_offset(module):
     t, observed = significance(*narrow[:3], effective, 2.0, narrow[3])
     assert min((s > 0).sum(), (t > 0).sum(), ((s > 0) & (t > 0)).sum(), ((s == 0) | (t == 0)).sum()) > 3
     scale = luma(wide[1])
-    near(got.gain, [ratio(c, p, scale, s) for c, p in zip(*wide[:2], strict=True)])
+    near(before.color, [ratio(c, p, scale, s) for c, p in zip(*wide[:2], strict=True)])
     luminance_gain = ratio(luma(wide[0]), scale, scale, s)
-    near(got.luminance_gain, luminance_gain)
-    near(got.offset, [t * (c - p) for c, p in zip(*narrow[:2], strict=True)])
+    near(before.luminance, luminance_gain)
+    near(got.color, [t * (c - p) for c, p in zip(*narrow[:2], strict=True)])
     grown = ratio(luma(narrow[0]), luma(narrow[1]), luma(narrow[1]), t)
     near(got.keep, (1 - s) * (1 - t) * (luminance_gain * grown) ** 2)
     near(got.variance, (1 - (1 - s) * (1 - t)) * observed)
+    dimmed = np.maximum(1.0, 1.0 / grown) ** 2
+    assert 3 < (dimmed > 1).sum() < 27
+    near(got.dimmed, dimmed)
+    near(got.noise, dimmed * s**2 * effective + t**2 * effective)
 
 
 def check_correction(module):
@@ -105,14 +110,16 @@ def check_correction(module):
     color, first, noise = planes(8), RNG.gamma(1.0, 1.0, 8), RNG.gamma(1.0, 1.0, 8)
     gain, offset = planes(8), tuple(o - 2.0 for o in planes(8))
     luminance_gain, keep, variance = planes(8)
-    correction = module.Correction(gain, offset, luminance_gain, keep, variance)
-    got, moments, change = module._correct(color, (first, noise + first**2), correction)
+    dimmed, added, worth = planes(8)
+    correction = judging.Correction(gain, luminance_gain, judging.Offset(offset, keep, variance, dimmed, added))
+    got, moments, change, left = module._correct(color, (first, noise + first**2), worth, correction)
     wanted = [np.maximum(g * c + o, 0.0) for g, c, o in zip(gain, color, offset, strict=True)]
     assert (np.array(wanted) == 0).any()
     near(got, wanted)
     mean = np.maximum(luminance_gain * first + luma(offset), 0.0)
     near(moments[0], mean)
     near(moments[1], keep * noise + variance + mean**2)
+    near(left, 1.0 / (dimmed / worth + added))
     near(change, (luma(wanted) - luma(color)) / np.maximum(luma(wanted), luma(color)))
 
 
@@ -199,24 +206,25 @@ CHECKS = {
         "gain in the dark": ("lit = scale > _DARK", "lit = scale > 0.0"),
     },
     check_sums: {
-        "product added": ("s.current2 - 2.0 * c.luminance_gain", "s.current2 + 2.0 * c.luminance_gain"),
-        "variance scaled like the light": ("c.luminance_gain**2 * s.noise", "c.luminance_gain * s.noise"),
+        "product added": ("s.current2 - 2.0 * gain.luminance", "s.current2 + 2.0 * gain.luminance"),
+        "variance scaled like the light": ("gain.luminance**2 * s.noise", "gain.luminance * s.noise"),
         "negative noise": ("jnp.clip(moments[1] - moments[0] * moments[0], 0.0,",
                            "jnp.clip(moments[1] - moments[0] * moments[0], -9.0,"),
     },
     check_gain_then_offset: {
-        "gain's threshold for the variance": ("(1.0 - significance) * luminance_gain**2, significance",
-                                            "luminance_gain**2, significance"),
+        "gain without a noise of its own": ("significance**2 * effective))", "0.0 * effective))"),
         "offset however insignificant": ("significance * (c - p)", "(c - p)"),
-        "both for either": ("1.0 - (1.0 - before.variance) * (1.0 - significance)", "before.variance * significance"),
-        "old variance not scaled": ("before.keep * (1.0 - significance) * grown**2", "before.keep * (1.0 - significance)"),
-        "variance of the gain's comparison lost": ("keep=keep, variance=either * observed", "keep=keep, variance=observed"),
+        "both for either": ("(1.0 - gain.significance) * (1.0 - sig", "1.0 - gain.significance * (1.0 * sig"),
+        "old variance not scaled": ("keep = neither * (gain.luminance * grown) ** 2", "keep = neither * gain.luminance**2"),
+        "variance of the gain's comparison lost": ("keep, (1.0 - neither) * observed,", "keep, significance * observed,"),
+        "noise of brighter light": ("1.0 / jnp.minimum(grown, 1.0) ** 2", "1.0 / grown**2"),
+        "noise of the gain lost": ("gain.noise * dimmed + significance**2", "significance**2"),
     },
     check_correction: {
         "darker than black": ("jnp.clip(gain * jnp.minimum(past, most) + offset, 0.0, most)", "gain * past + offset"),
         "moments left behind": ("first = _within(c.luminance_gain, first,", "first = _within(1.0, first,"),
-        "variance for the second moment": ("(first, noise + first * first), change", "(first, noise), change"),
-        "new noise not added": ("second - first * first, 0.0), c.variance,", "second - first * first, 0.0), 0.0,"),
+        "variance for the second moment": ("(first, variance + first * first), change", "(first, variance), change"),
+        "new noise not added": ("second - first * first, 0.0), offset.variance,", "second - first * first, 0.0), 0.0,"),
     },
     check_paths: {
         "paths that never meet": (".sum() / (_KERNEL**2).sum() ** levels) ** 2)", ".sum() / (whole**2).sum()) ** 2)"),
@@ -249,7 +257,9 @@ CHECKS = {
         "matt things reflect": ("moved if r else still", "still if r else moved"),
     },
 }  # fmt: skip
-MODULE_OF = {
+MODULE_OF = dict.fromkeys(
+    (check_significance, check_ratio, check_sums, check_gain_then_offset, check_paths), "significance"
+) | {
     check_cells: "cells",
     check_mirror: "reflections",
     check_roughness: "reflections",

@@ -160,7 +160,7 @@ MUTANTS = {
         "reprojection",
         "return means, found | found_around",
         "return (*means[:2], read_at(history.history_length, jnp.floor(y + 0.5).astype(jnp.int32),"
-        " jnp.floor(x + 0.5).astype(jnp.int32))[0]), found | found_around",
+        " jnp.floor(x + 0.5).astype(jnp.int32))[0], *means[3:]), found | found_around",
         "test_reproject",
     ),
     # Variance

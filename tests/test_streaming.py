@@ -203,7 +203,7 @@ def test_a_checkpoint_of_another_size_is_an_error(shot, tmp_path):
     state = tmp_path / "out" / ".svgf-jax" / "checkpoint.npz"
     with np.load(state) as file:
         entries = dict(file)
-    for name in History._fields[:-1]:
+    for name in set(History._fields) - {"effective_history", "taa"}:
         rows = entries[name].shape.index(SIZE[0])
         entries[name] = entries[name].take(range(3), axis=rows)
     np.savez(state, **entries)

@@ -85,7 +85,8 @@ def denoise(
         float_: Write 32-bit float instead of 16-bit.
         compression: EXR compression of the output.
         only_denoised: Leave out the input's other layers and header attributes.
-        diagnostics: Add the layers svgf.variance.*, svgf.change.* (preset adaptive), svgf.history_length and svgf.valid.
+        diagnostics: Add the layers svgf.variance.*, svgf.effective_history.*, svgf.history_length, svgf.valid, and with preset
+            adaptive svgf.change.*.
         png: Also write a tone-mapped PNG of each frame.
         video: Also write an MP4 of the whole (needs the extra `video`).
         fps: Frames per second of the video.

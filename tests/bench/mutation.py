@@ -66,8 +66,13 @@ TESTS = {
     "adaptation": [
         "tests/test_light_mutants.py::test_by_hand",
         f"{FOLLOWED}the_stage",
-        f"{FOLLOWED}the_effective",
         f"{FOLLOWED}without",
+        f"{FOLLOWED}it_is_diff",
+    ],
+    "significance": [
+        "tests/test_light_mutants.py::test_by_hand",
+        f"{FOLLOWED}the_stage",
+        f"{FOLLOWED}the_effective",
         f"{FOLLOWED}it_is_diff",
     ],
     "cells": ["tests/test_light_mutants.py::test_by_hand", f"{FOLLOWED}the_stage"],
