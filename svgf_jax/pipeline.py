@@ -27,7 +27,7 @@ def init(frame: Frame, *, config: Config = Config(), effective_history: bool = F
         frame: only its shapes and its dtype matter.
         config: only its `taa` matters.
         effective_history: also keep, from frame to frame, how many frames each signal's history is worth: the output of the
-            same name, else None. It changes nothing else, and takes 3 to 5 % more time.
+            same name, else None. It changes nothing else, and takes about 5 % more time.
     """
     check_frame(frame)
     signals, height, width, _ = frame.radiance.shape
