@@ -1,8 +1,9 @@
 """What following the light looks like beside the preset `paper`. (What it costs: speed.py step.)
 
-    python tests/bench/adaptive.py FOLDER OUT.png [--frames 11,12]     (reference, paper, adaptive, its change)
+    python tests/bench/adaptive.py FOLDER OUT.png [--frames 11,12]     (reference, paper, adaptive, its change and its worth)
 
-One row a frame; the change of the direct light, red = the history was made brighter, blue = darker.
+One row a frame; the change of the direct light, red = the history was made brighter, blue = darker, and how many frames its history
+is worth, bright = the most there may be, dark = none.
 """
 
 import argparse
@@ -13,9 +14,10 @@ import numpy as np
 from PIL import Image
 
 import svgf_jax as sj
-from svgf_jax import preview
+from svgf_jax import page, preview
 
 PRESETS = ("paper", "adaptive")
+MOST = (2 - 0.35) / 0.35  # frames that a mean with an alpha of .35 is worth
 
 
 def outputs(folder: str, name: str, wanted: list[int]) -> list[sj.Output]:
@@ -24,18 +26,11 @@ def outputs(folder: str, name: str, wanted: list[int]) -> list[sj.Output]:
     params = jax.tree.map(np.float32, params)
     for i in range(max(wanted) + 1):
         frame = sj.read_frame(source, i).frame
-        history = sj.init(frame) if history is None else history
+        history = sj.init(frame, effective_history=True) if history is None else history
         history, output = sj.step(history, frame, params=params, config=config)
         if i in wanted:
             found.append(jax.tree.map(np.asarray, output))
     return found
-
-
-def signed(values: np.ndarray) -> np.ndarray:
-    """-1 blue, 0 white, 1 red, 8 bits."""
-    up, down = np.clip(values, 0, 1)[..., None], np.clip(-values, 0, 1)[..., None]
-    color = 1 - up * np.array([0.1, 0.85, 0.9]) - down * np.array([0.9, 0.7, 0.1])
-    return np.round(255 * color).astype(np.uint8)
 
 
 def halved(image: np.ndarray, factor: float = 1.5) -> np.ndarray:
@@ -52,7 +47,8 @@ def pictures(folder: str, out: Path, frames: list[int]) -> None:
     rows = []
     for at, one, other in zip(frames, paper, adaptive, strict=True):
         shown = [preview.to_8bit(image) for image in (references[at], one.image, other.image)]
-        rows.append(np.concatenate([halved(p) for p in (*shown, signed(other.change[0]))], axis=1))
+        maps = page.signed(other.change[0]), page.heat(other.effective_history[0] / MOST)
+        rows.append(np.concatenate([halved(p) for p in (*shown, *maps)], axis=1))
     Image.fromarray(np.concatenate(rows)).quantize(255).save(out, optimize=True)
 
 
