@@ -1,8 +1,19 @@
 """Where a reflection was one frame ago: virtual motion by hit distance. NumPy only.
 
-What a mirror shows doesn't move with the mirror's surface but with the *virtual point*: the reflected thing, seen straight on
+What a flat mirror shows doesn't move with the mirror's surface but with the *virtual point*: the reflected thing, seen straight on
 through the surface, at the hit distance behind it along the view ray. So for point x seen from eye e, v = x + f hit (x - e) /
 |x - e|, and the reflection's previous pixel is where the previous camera sees v. Exact for a flat, still mirror of still things.
+
+A curved mirror turns the ray by more: its image is elsewhere, and at slanting incidence in two places at once (astigmatism). With d
+the view direction, the previous eye lies D along d before x, and t across it; by how much, s across d, has the image moved on the
+surface? From x + s the reflected thing lies s / (f hit) beside the view ray's continuation, as with the flat mirror, and the
+normal is another by dn(s), which turns the ray by 2 ((d . dn) n + cos dn), cos = -d . n. The ray that arrives must be the one to
+the previous eye, (t - s) / D. So
+
+    (t - s) / D = s / (f hit) + 2 ((d . dn) n + cos dn),    dn(s) linear in s:
+
+two linear equations, of first order in t; for dn = 0 exactly the virtual point. dn comes from the differences of normals and
+positions between neighbouring pixels of the same object, of the two along an axis the smaller one: flat facets stay flat.
 
 f says how far a rough surface's image lies behind it, 1 for a mirror, 0 for a matt surface, which looks the same from all sides:
 the factor of the dominant direction of the GGX lobe, f = (1 - r) (sqrt(1 - r) + r) with roughness r (Lagarde & de Rousiers,
@@ -19,6 +30,7 @@ from svgf_jax.cameras import BEHIND, Camera, Cameras, find_camera, pixel_centres
 
 LONGEST = 1e6
 """Frames of history where nothing shortens it."""
+_BENT = 1e-10  # squared difference of neighbouring normals above which a mirror isn't flat: 1e-5 radians
 
 
 class Reflections(NamedTuple):
@@ -60,8 +72,11 @@ def trace_reflections(
     camera, before = find_camera(cameras, number), find_camera(cameras, previous)
     surface = object_id != -1
     with np.errstate(all="ignore"):
+        shown = pixel_centres(depth.shape, origin)
         if position is None:
             position = position_from_depth(camera, np.where(surface, depth, 1.0), origin=origin)
+        else:
+            shown = _screen(camera, position.astype(np.float64))  # samples may be jittered within their pixels
         position = position.astype(np.float64)
         away = position - _eye(camera)
         away /= np.linalg.norm(away, axis=-1, keepdims=True)
@@ -71,12 +86,12 @@ def trace_reflections(
             share * np.maximum(hit_distance, 0.0), 1e6 * np.abs(depth)
         )  # so far behind, it moves as at infinity
         was = previous_position(cameras, position, object_id, number=number, previous=previous)
-        centres = pixel_centres(depth.shape, origin)
-        motion = _screen(before, was + behind[..., None] * away) - centres
-        on_surface = _screen(before, was) - centres
+        image = was + _moved(camera, _eye(before), was, away, behind, position, normal, object_id)
+        motion = _screen(before, image) - shown
+        on_surface = _screen(before, was) - shown
         drift = (1.0 - share) * np.hypot(*np.moveaxis(motion - on_surface, -1, 0))  # the motion itself has the factor f
         longest = np.minimum(1.0 + 1.0 / np.maximum(drift, 1e-9), LONGEST)
-        there = _depth_along(before, was, was + behind[..., None] * away, normal.astype(np.float64))
+        there = _depth_along(before, was, image, normal)
     motion = np.where((surface & ~np.isnan(hit_distance))[..., None], motion, np.nan)
     return Reflections(motion.astype(np.float32), there.astype(np.float32), longest.astype(np.float32))
 
@@ -121,6 +136,69 @@ def signals_reflected(
     return tuple(np.stack(fields) for fields in zip(*(moved if r else still for r in reflect), strict=True))
 
 
+def _moved(
+    camera: Camera,
+    eye: np.ndarray,
+    was: np.ndarray,
+    away: np.ndarray,
+    behind: np.ndarray,
+    position: np.ndarray,
+    normal: np.ndarray,
+    object_id: np.ndarray,
+) -> np.ndarray:
+    """s of the module's docstring, `[H, W, 3]`, for points that were at `was`; NaN where a hollow mirror shows nothing clear."""
+    distance = _dot(was - eye, away)
+    across = eye - was + distance[..., None] * away
+    ratio = behind / distance
+    moved = (ratio / (1.0 + ratio))[..., None] * across
+    sides = [_nearer(normal, object_id, axis) for axis in (1, 0)]
+    bent = np.maximum(*(turn for _, turn in sides)) > _BENT
+    here = np.nonzero(bent & (behind > 0))
+    if not here[0].size:
+        return moved
+    d, n, ratio, behind = (a[here] for a in (away, normal.astype(np.float64), ratio[..., None], behind[..., None]))
+    steps, columns = [], []
+    for (side, _), axis in zip(sides, (1, 0), strict=True):
+        offset = side[here]
+        there = tuple(at + offset * (k == axis) for k, at in enumerate(here))
+        step = np.where(offset[:, None] == 0, camera.world_to_camera[1 - axis, :3], position[there] - position[here])
+        step -= _dot(step, d)[:, None] * d
+        turn = normal[there].astype(np.float64) - n
+        steps.append(step)
+        columns.append((1.0 + ratio) * step + 2.0 * behind * (_dot(d, turn)[:, None] * n - _dot(d, n)[:, None] * turn))
+    (tx, ty), (cx, cy), wanted = steps, columns, ratio * across[here]
+    xx, xy, yx, yy = _dot(tx, cx), _dot(tx, cy), _dot(ty, cx), _dot(ty, cy)
+    rx, ry = _dot(tx, wanted), _dot(ty, wanted)
+    determinant = xx * yy - xy * yx
+    # On a flat mirror: (1 + ratio)^2 |tx x ty|^2. Near 0 is the focus of a hollow one.
+    flat = (1.0 + ratio[:, 0]) ** 2 * (_dot(tx, tx) * _dot(ty, ty) - _dot(tx, ty) ** 2)
+    determinant = np.where(np.abs(determinant) > 0.01 * flat, determinant, np.nan)
+    x, y = (rx * yy - ry * xy) / determinant, (ry * xx - rx * yx) / determinant
+    moved[here] = x[:, None] * tx + y[:, None] * ty
+    return moved
+
+
+def _nearer(normal: np.ndarray, object_id: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Along an axis, the neighbour of the same object whose normal is nearer (1 = ahead, -1 = behind, 0 = none); and how near.
+
+    How near: `[H, W]`, the squared difference of the normals, 0 where there is none.
+    """
+    turn = np.diff(normal, axis=axis)
+    square = np.where(np.diff(object_id, axis=axis) == 0, _dot(turn, turn), np.inf)
+    square = np.where(np.isnan(square), np.inf, square)
+    edge = [(0, 0), (0, 0)]
+    ahead, behind = (
+        np.pad(square, [*edge[:axis], side, *edge[axis + 1 :]], constant_values=np.inf) for side in ((0, 1), (1, 0))
+    )
+    least = np.minimum(ahead, behind)
+    some = np.isfinite(least)
+    return np.where(some, np.where(ahead <= behind, 1, -1), 0), np.where(some, least, 0.0)
+
+
+def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.einsum("...i,...i->...", one, other)
+
+
 def _eye(camera: Camera) -> np.ndarray:
     return np.linalg.inv(camera.world_to_camera)[:3, 3]
 
@@ -135,7 +213,7 @@ def _screen(camera: Camera, point: np.ndarray) -> np.ndarray:
 def _depth_along(camera: Camera, position: np.ndarray, towards: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Depth at which the ray from the camera to `towards` meets the plane through `position`."""
     eye, forward = _eye(camera), camera.world_to_camera[2]
-    ray = towards - eye
-    slant = (ray * normal).sum(-1)
-    reach = ((position - eye) * normal).sum(-1) / np.where(np.abs(slant) > 1e-12, slant, 1.0)
+    ray, normal = towards - eye, normal.astype(np.float64)
+    slant = _dot(ray, normal)
+    reach = _dot(position - eye, normal) / np.where(np.abs(slant) > 1e-12, slant, 1.0)
     return np.where(np.abs(slant) > 1e-12, reach * (ray @ forward[:3]), position @ forward[:3] + forward[3])
