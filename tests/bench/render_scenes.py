@@ -1,13 +1,20 @@
 """Render moving scenes at one sample a pixel, with references: sequences that no preset of this library was chosen on.
 
     pip install mitsuba            (3.9 was used; the variant llvm_ad_rgb needs an LLVM shared library)
-    python tests/bench/render_scenes.py FOLDER [spheres] [stairs] [--frames 12] [--spp 256] [--size 480x270]
+    python tests/bench/render_scenes.py FOLDER [spheres] [stairs] [mirror] [--frames 12] [--spp 256] [--size 480x270]
 
 `spheres`: glossless spheres that move over a checkered floor under a small light: sharp shadows that move.
 `stairs`: a camera climbs along still stairs lit by a small lamp and a window: nothing moves but the camera.
+`mirror`: a camera moves through a room whose floor is a mirror, a lacquered pattern and a rough metal; a golden ball and a glazed
+one stand still, a matt ball and a box move.
 
 A frame is native: direct, indirect, emission, albedo, normal, depth, motion, id. Rays go through pixel centres, so the guides are
 free of noise. direct = emitted light and one bounce by next event estimation and BSDF sampling, indirect = two bounces more.
+
+`mirror` has instead diffuse_direct, diffuse_indirect and specular (what glossy lobes show, up to four bounces), with `albedo`,
+`specular_albedo`, `roughness` and `hit_distance`, as long as this sample's ray is; `table.toml` names them. The references of
+`mirror` hold besides: `id`, and `reflected.id`, of what a perfect mirror would show there (-1 on matt surfaces); their attribute
+`shapes` names the ids from 0 on.
 """
 
 import argparse
@@ -85,7 +92,80 @@ def stairs(t):
     return shapes, {}, (0.1 * np.sin(0.2 * t), 1.6 + 0.03 * t, 3.4 - 0.09 * t), (0.1, 1.5, -2.5)
 
 
-SCENES = {"spheres": spheres, "stairs": stairs}
+def metal(*rgb, roughness=0.0):
+    kind = {"type": "roughconductor", "alpha": roughness**2} if roughness else {"type": "conductor"}
+    return {**kind, "material": "none", "specular_reflectance": {"type": "rgb", "value": list(rgb)}}
+
+
+def coated(below, roughness=0.0):
+    kind = {"type": "roughplastic", "alpha": roughness**2} if roughness else {"type": "plastic"}
+    return {**kind, "int_ior": COAT, "diffuse_reflectance": below}
+
+
+def mirror(t):
+    """As `spheres`; what reflects is listed in `GLOSS`."""
+    tiles = checker((0.5, 0.25, 0.18), (0.12, 0.1, 0.1), 8)["reflectance"]
+    shapes = {
+        "mirror": rectangle((-1.7, 0, -1), (-1.7, 1, -1), (1.3, 3.5), bsdf=metal(*GLOSS["mirror"][1])),
+        "lacquer": rectangle((0.1, 0, -1), (0.1, 1, -1), (0.5, 3.5), bsdf=coated(tiles)),
+        "rough": rectangle((1.8, 0, -1), (1.8, 1, -1), (1.2, 3.5), bsdf=metal(*GLOSS["rough"][1], roughness=0.3)),
+        "back": rectangle(
+            (0, 2, -4.5), (0, 2, 0), (3, 2), up=(0, 1, 0), bsdf=checker((0.7, 0.66, 0.55), (0.2, 0.3, 0.45), 8)
+        ),
+        "left": rectangle(
+            (-3, 2, -1), (0, 2, -1), (3.5, 2), up=(0, 1, 0), bsdf=checker((0.7, 0.3, 0.2), (0.6, 0.55, 0.5), 6)
+        ),
+        "right": rectangle((3, 2, -1), (0, 2, -1), (3.5, 2), up=(0, 1, 0), bsdf=diffuse(0.35, 0.6, 0.35)),
+        "front": rectangle(
+            (0, 2, 2.5), (0, 2, 0), (3, 2), up=(0, 1, 0), bsdf=checker((0.7, 0.7, 0.7), (0.3, 0.3, 0.3), 6)
+        ),
+        "roof": rectangle((0, 4, -1), (0, 0, -1), (3, 3.5), bsdf=diffuse(0.75, 0.73, 0.7)),
+        "panel": rectangle((0.3, 3.98, -1.5), (0.3, 0, -1.5), (0.8, 0.8), emitter=lamp(13, 12.5, 11)),
+        "lamp": rectangle((-2.98, 2.2, -2.5), (0, 2.2, -2.5), (0.25, 0.25), up=(0, 1, 0), emitter=lamp(14, 9, 5)),
+    }
+    for name, (x, z), radius, bsdf in (
+        ("gold", (-0.8, -2.5), 0.6, metal(*GLOSS["gold"][1])),
+        ("glazed", (1.1, -2.5), 0.5, coated({"type": "rgb", "value": [0.15, 0.25, 0.6]}, roughness=0.2)),
+    ):
+        place = mi.ScalarTransform4f().translate([x, radius, z]) @ mi.ScalarTransform4f().scale(radius)
+        shapes[name] = {"type": "sphere", "to_world": place, "bsdf": bsdf}
+    places = {
+        "ball": np.array([-2.3 + 0.11 * t, 0.6 + 0.2 * np.cos(0.5 * t), -1.5]),
+        "box": np.array([2.1 - 0.09 * t, 0.5, -1.4 + 0.03 * t]),
+    }
+    put = mi.ScalarTransform4f().translate
+    shapes["ball"] = {
+        "type": "sphere",
+        "to_world": put(places["ball"].tolist()) @ mi.ScalarTransform4f().scale(0.35),
+        "bsdf": checker((0.85, 0.75, 0.2), (0.3, 0.15, 0.5), 5),
+    }
+    shapes["box"] = box(places["box"], (0.3, 0.3, 0.3), diffuse(0.75, 0.2, 0.25))
+    return shapes, places, (-0.5 + 0.06 * t, 1.5, 2.2 - 0.02 * t), (-0.2 + 0.02 * t, 0.6, -1.6)
+
+
+SCENES = {"spheres": spheres, "stairs": stairs, "mirror": mirror}
+COAT = 1.5  # index of refraction
+GLOSS = {  # what reflects: roughness, and the color of metal (None: a coat)
+    "mirror": (0.0, (0.85, 0.87, 0.9)),
+    "lacquer": (0.0, None),
+    "rough": (0.3, (0.75, 0.7, 0.65)),
+    "gold": (0.0, (0.95, 0.72, 0.35)),
+    "glazed": (0.2, None),
+}
+TABLE = """title = "render_scenes.py: mirror"
+[[light]]
+name = "diffuse_direct"
+channels = ["diffuse_direct.RGB"]
+albedo = ["albedo.RGB"]
+[[light]]
+name = "diffuse_indirect"
+channels = ["diffuse_indirect.RGB"]
+albedo = ["albedo.RGB"]
+[[light]]
+name = "specular"
+channels = ["specular.RGB"]
+albedo = ["specular_albedo.RGB"]
+"""
 FOCAL = 1.2  # of the half width
 
 
@@ -125,6 +205,66 @@ def radiance(scene, rays, seed, width, height, spp):
     return np.maximum(direct - emission, 0), np.maximum(full - direct, 0)
 
 
+def glossy_radiance(scene, rays, seed, width, height, spp):
+    """(diffuse direct, diffuse indirect, specular) `[H, W, 3]`, and how long the specular ray is `[H, W]`."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, width * height * spp)
+    si = scene.ray_intersect(rays)
+    bsdf = si.bsdf()
+    matt, shiny = mi.BSDFContext(), mi.BSDFContext()
+    matt.type_mask = int(mi.BSDFFlags.DiffuseReflection)
+    shiny.type_mask = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.GlossyReflection)
+    path = mi.load_dict({"type": "path", "max_depth": 4, "rr_depth": 100})
+    mean = lambda v, c: np.nan_to_num(np.array(v).T.reshape(height, width, spp, c)).mean(axis=2)  # noqa: E731
+
+    towards, light = scene.sample_emitter_direction(si, sampler.next_2d(), True)
+    direct = bsdf.eval(matt, si, si.to_local(towards.d)) * light
+
+    def bounce(context):
+        sample, weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d())
+        ray = mi.RayDifferential3f(si.spawn_ray(si.to_world(sample.wo)))
+        seen = scene.ray_intersect(ray)
+        active = dr.any(weight > 0)
+        found = path.sample(scene, sampler, ray, active=active)[0]
+        return dr.select(active, weight, 0), found, seen, active
+
+    weight, found, seen, _ = bounce(matt)
+    indirect = weight * (found - seen.emitter(scene).eval(seen))  # that was direct
+    weight, found, seen, active = bounce(shiny)
+    reach = dr.select(active, dr.select(seen.is_valid(), seen.t, dr.inf), 0)
+    return (
+        np.maximum(mean(direct, 3), 0),
+        np.maximum(mean(indirect, 3), 0),
+        mean(weight * found, 3),
+        mean(reach, 1)[..., 0],
+    )
+
+
+def gloss(scene, rays, names, ids, width, height):
+    """Albedo and roughness of what reflects, by id, and what a perfect mirror shows there."""
+    si = scene.ray_intersect(rays)
+    cosine = np.array(mi.Frame3f.cos_theta(si.wi)).reshape(height, width)
+    coat = np.array(mi.fresnel(mi.Float(np.abs(cosine).ravel()), COAT)[0]).reshape(height, width, 1)
+    seen = scene.ray_intersect(si.spawn_ray(si.to_world(mi.reflect(si.wi))))
+    reflected = shape_ids(scene, seen, names, width, height)
+    albedo, roughness, metals = np.zeros((height, width, 3)), np.zeros((height, width)), np.zeros((height, width), bool)
+    for name, (rough, color) in GLOSS.items():
+        mine = ids == names.index(name)
+        albedo[mine] = np.broadcast_to(coat, albedo.shape)[mine] if color is None else color
+        roughness[mine] = rough
+        metals |= mine & (color is not None)
+    matt = ~np.isin(ids, [names.index(name) for name in GLOSS])
+    return albedo, np.where(matt, 1.0, roughness), metals, np.where(matt, -1.0, reflected)
+
+
+def shape_ids(scene, si, names, width, height):
+    ids = np.full((height, width), -1.0, np.float32)
+    seen = np.array(dr.reinterpret_array(mi.UInt32, si.shape)).reshape(height, width)
+    for shape in scene.shapes():
+        ids[seen == np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0]] = names.index(shape.id())
+    return ids
+
+
 def guides(scene, rays, names, places, before, now, then, width, height):
     """All but radiance, as native channels."""
     si = scene.ray_intersect(rays)
@@ -132,11 +272,7 @@ def guides(scene, rays, names, places, before, now, then, width, height):
     grid = lambda v, c: np.array(v).T.reshape(height, width, c) * hit[..., None]  # noqa: E731
     albedo, emission = si.bsdf().eval_diffuse_reflectance(si), si.emitter(scene).eval(si)
     point = np.array(si.p).T.reshape(height, width, 3).astype(np.float64)
-    ids = np.full((height, width), -1.0, np.float32)
-    seen = np.array(dr.reinterpret_array(mi.UInt32, si.shape)).reshape(height, width)
-    for shape in scene.shapes():
-        ids[seen == np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0]] = names.index(shape.id())
-    ids[~hit] = -1
+    ids = np.where(hit, shape_ids(scene, si, names, width, height), -1)
     normal = grid(si.sh_frame.n, 3)
     normal *= np.where((normal * (eye_of(now) - point)).sum(-1, keepdims=True) < 0, -1, 1)  # towards the camera
     point_then = point.copy()
@@ -173,6 +309,31 @@ def write(path, channels, **attributes):
     )
 
 
+def draw_matt(folder, t, scene, names, one, many, layers, seeds, width, height):
+    noisy = radiance(scene, one, 2 * t, width, height, 1)
+    write(folder / f"frame_{t:04d}.exr", rgb("direct", noisy[0]) | rgb("indirect", noisy[1]) | layers)
+    direct, indirect = np.mean([radiance(scene, many, seed, width, height, WAVE) for seed in seeds], axis=0)
+    shown = {k: v for k, v in layers.items() if k.startswith("emission")}
+    write(folder / f"ref_{t:04d}.exr", rgb("direct", direct) | rgb("indirect", indirect) | shown, spp=len(seeds) * WAVE)
+
+
+def draw_glossy(folder, t, scene, names, one, many, layers, seeds, width, height):
+    ids = layers["id.I"]
+    albedo, roughness, metals, reflected = gloss(scene, one, names, ids, width, height)
+    layers |= {k: np.where(metals, 0, v) for k, v in layers.items() if k.startswith("albedo")}
+    *noisy, reach = glossy_radiance(scene, one, 2 * t, width, height, 1)
+    kinds = ("diffuse_direct", "diffuse_indirect", "specular")
+    light = {k: v for kind, image in zip(kinds, noisy, strict=True) for k, v in rgb(kind, image).items()}
+    layers |= rgb("specular_albedo", albedo) | {"roughness.Y": roughness, "hit_distance.Z": reach}
+    write(folder / f"frame_{t:04d}.exr", light | layers)
+    clean = np.mean([np.sum(glossy_radiance(scene, many, s, width, height, WAVE)[:3], axis=0) for s in seeds], axis=0)
+    clean += np.stack([layers[f"emission.{c}"] for c in "RGB"], -1)
+    beauty = {c: clean[..., i] for i, c in enumerate("RGB")}
+    told = {"spp": len(seeds) * WAVE, "shapes": " ".join(names)}
+    write(folder / f"ref_{t:04d}.exr", beauty | {"id.I": ids, "reflected.id": reflected}, **told)
+    (folder / "table.toml").write_text(TABLE)
+
+
 def render(name, folder, frames, spp, width, height):
     folder.mkdir(parents=True, exist_ok=True)
     made = [SCENES[name](t) for t in range(frames)]
@@ -183,14 +344,11 @@ def render(name, folder, frames, spp, width, height):
         names = list(shapes)
         before, then = made[max(t - 1, 0)][1], lenses[max(t - 1, 0)]
         one = primary_rays(eye, lenses[t][0], width, height, 1)
-        noisy = radiance(scene, one, 2 * t, width, height, 1)
         layers = guides(scene, one, names, places, before, lenses[t], then, width, height)
-        write(folder / f"frame_{t:04d}.exr", rgb("direct", noisy[0]) | rgb("indirect", noisy[1]) | layers)
         many = primary_rays(eye, lenses[t][0], width, height, WAVE)
-        parts = [radiance(scene, many, 1000 + 64 * t + k, width, height, WAVE) for k in range(spp // WAVE)]
-        direct, indirect = np.mean(parts, axis=0)
-        shown = {k: v for k, v in layers.items() if k.startswith("emission")}
-        write(folder / f"ref_{t:04d}.exr", rgb("direct", direct) | rgb("indirect", indirect) | shown, spp=spp)
+        seeds = [1000 + 64 * t + k for k in range(spp // WAVE)]
+        draw = draw_glossy if name == "mirror" else draw_matt
+        draw(folder, t, scene, names, one, many, layers, seeds, width, height)
         moved = {}
         for key, place in places.items():
             matrix = np.eye(4)
