@@ -131,7 +131,7 @@ def previous_position(
 ) -> np.ndarray:
     """World position `[H, W, 3]` that the surface points of frame `number` had at frame `previous`."""
     moved = position.astype(np.float64)
-    for key, matrix in _object_motion(cameras, number, previous).items():
+    for key, matrix in object_motion(cameras, number, previous).items():
         here = object_id == key
         if here.any():
             moved[here] = moved[here] @ matrix[:3, :3].T + matrix[:3, 3]
@@ -308,7 +308,7 @@ def _seen_at(camera: Camera, depth: np.ndarray, origin: tuple[int, int]) -> np.n
     return np.stack([x, y, depth], -1)
 
 
-def _object_motion(cameras: Cameras, number: int, previous: int) -> dict[int, np.ndarray]:
+def object_motion(cameras: Cameras, number: int, previous: int) -> dict[int, np.ndarray]:
     """World -> world from one frame to another by object id, for the objects that move."""
     here, there = find_camera(cameras, number), find_camera(cameras, previous)
     if not here.object_motion and not there.object_motion:

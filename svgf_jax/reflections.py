@@ -2,7 +2,7 @@
 
 What a flat mirror shows doesn't move with the mirror's surface but with the *virtual point*: the reflected thing, seen straight on
 through the surface, at the hit distance behind it along the view ray. So for point x seen from eye e, v = x + f hit (x - e) /
-|x - e|, and the reflection's previous pixel is where the previous camera sees v. Exact for a flat, still mirror of still things.
+|x - e|, and the reflection's previous pixel is where the previous camera sees v. Exact for flat mirrors of still things.
 
 A curved mirror turns the ray by more: its image is elsewhere, and at slanting incidence in two places at once (astigmatism). With d
 the view direction, the previous eye lies D along d before x, and t across it; by how much, s across d, has the image moved on the
@@ -15,6 +15,10 @@ the previous eye, (t - s) / D. So
 two linear equations, of first order in t; for dn = 0 exactly the virtual point. dn comes from the differences of normals and
 positions between neighbouring pixels of the same object, of the two along an axis the smaller one: flat facets stay flat.
 
+What moves carries its picture along: if a thing was m elsewhere, as seen from the mirror, its image was m - 2 (m . n) n elsewhere.
+Which thing it is, the frame itself tells where it shows the reflected point too, at that point's depth; what is seen in the mirror
+alone is taken to stand still. Mirrors that move are exact too, unless they turn.
+
 f says how far a rough surface's image lies behind it, 1 for a mirror, 0 for a matt surface, which looks the same from all sides:
 the factor of the dominant direction of the GGX lobe, f = (1 - r) (sqrt(1 - r) + r) with roughness r (Lagarde & de Rousiers,
 Moving Frostbite to Physically Based Rendering, 2014). In between the image is neither here nor there: its history, which lies
@@ -26,10 +30,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from svgf_jax.cameras import BEHIND, Camera, Cameras, find_camera, pixel_centres, position_from_depth, previous_position
+from svgf_jax.cameras import (
+    BEHIND,
+    Camera,
+    Cameras,
+    find_camera,
+    object_motion,
+    pixel_centres,
+    position_from_depth,
+    previous_position,
+)
 
 LONGEST = 1e6
 """Frames of history where nothing shortens it."""
+_SAME = 0.02  # relative difference of depths up to which a pixel shows the reflected point
 _BENT = 1e-10  # squared difference of neighbouring normals above which a mirror isn't flat: 1e-5 radians
 
 
@@ -81,12 +95,17 @@ def trace_reflections(
         away = position - _eye(camera)
         away /= np.linalg.norm(away, axis=-1, keepdims=True)
         r = np.clip(np.asarray(roughness, np.float64), 0.0, 1.0)
-        share = (1.0 - r) * (np.sqrt(1.0 - r) + r)
+        share = np.broadcast_to((1.0 - r) * (np.sqrt(1.0 - r) + r), depth.shape)
         behind = np.minimum(
             share * np.maximum(hit_distance, 0.0), 1e6 * np.abs(depth)
         )  # so far behind, it moves as at infinity
         was = previous_position(cameras, position, object_id, number=number, previous=previous)
-        image = was + _moved(camera, _eye(before), was, away, behind, position, normal, object_id)
+        carried = _carried(
+            cameras, position, was, away, normal, hit_distance, depth, object_id, number, previous, origin
+        )
+        image = was + _moved(
+            camera, _eye(before), was, away, behind, share[..., None] * carried, position, normal, object_id
+        )
         motion = _screen(before, image) - shown
         on_surface = _screen(before, was) - shown
         drift = (1.0 - share) * np.hypot(*np.moveaxis(motion - on_surface, -1, 0))  # the motion itself has the factor f
@@ -136,12 +155,50 @@ def signals_reflected(
     return tuple(np.stack(fields) for fields in zip(*(moved if r else still for r in reflect), strict=True))
 
 
+def _carried(
+    cameras: Cameras,
+    position: np.ndarray,
+    was: np.ndarray,
+    away: np.ndarray,
+    normal: np.ndarray,
+    hit_distance: np.ndarray,
+    depth: np.ndarray,
+    object_id: np.ndarray,
+    number: int,
+    previous: int,
+    origin: tuple[int, int],
+) -> np.ndarray:
+    """m - 2 (m . n) n of the module's docstring, `[H, W, 3]`; all 0 where nothing moves."""
+    if not object_motion(cameras, number, previous):
+        return np.zeros(position.shape)
+    camera = find_camera(cameras, number)
+    turned = away - 2.0 * _dot(away, normal)[..., None] * normal
+    reflected = position + hit_distance[..., None] * turned
+    column, row = (
+        np.clip(np.floor(at - first), -1, size).astype(int)
+        for at, first, size in zip(
+            np.moveaxis(_screen(camera, reflected), -1, 0), origin, depth.shape[::-1], strict=True
+        )
+    )
+    inside = (row >= 0) & (row < depth.shape[0]) & (column >= 0) & (column < depth.shape[1])
+    there = np.where(inside, row, 0), np.where(inside, column, 0)
+    far = reflected @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+    seen = inside & (np.abs(depth[there] - far) <= _SAME * far)
+    ids = np.where(seen, object_id[there], -1)
+    thing = np.where(
+        seen[..., None], previous_position(cameras, reflected, ids, number=number, previous=previous) - reflected, 0
+    )
+    moved = thing - (was - position)
+    return moved - 2.0 * _dot(moved, normal)[..., None] * normal
+
+
 def _moved(
     camera: Camera,
     eye: np.ndarray,
     was: np.ndarray,
     away: np.ndarray,
     behind: np.ndarray,
+    carried: np.ndarray,
     position: np.ndarray,
     normal: np.ndarray,
     object_id: np.ndarray,
@@ -149,8 +206,11 @@ def _moved(
     """s of the module's docstring, `[H, W, 3]`, for points that were at `was`; NaN where a hollow mirror shows nothing clear."""
     distance = _dot(was - eye, away)
     across = eye - was + distance[..., None] * away
+    further = _dot(carried, away)
+    behind = np.maximum(behind + further, 0.0)
     ratio = behind / distance
-    moved = (ratio / (1.0 + ratio))[..., None] * across
+    wanted = ratio[..., None] * across + (carried - further[..., None] * away)
+    moved = wanted / (1.0 + ratio)[..., None]
     sides = [_nearer(normal, object_id, axis) for axis in (1, 0)]
     bent = np.maximum(*(turn for _, turn in sides)) > _BENT
     here = np.nonzero(bent & (behind > 0))
@@ -166,7 +226,7 @@ def _moved(
         turn = normal[there].astype(np.float64) - n
         steps.append(step)
         columns.append((1.0 + ratio) * step + 2.0 * behind * (_dot(d, turn)[:, None] * n - _dot(d, n)[:, None] * turn))
-    (tx, ty), (cx, cy), wanted = steps, columns, ratio * across[here]
+    (tx, ty), (cx, cy), wanted = steps, columns, wanted[here]
     xx, xy, yx, yy = _dot(tx, cx), _dot(tx, cy), _dot(ty, cx), _dot(ty, cy)
     rx, ry = _dot(tx, wanted), _dot(ty, wanted)
     determinant = xx * yy - xy * yx
