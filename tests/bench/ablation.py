@@ -43,7 +43,7 @@ def scores(base: str, only: list[str]) -> None:
     for name in SEQUENCES:
         source = open_source(DATA / name)
         references, _ = pair_references(source.sequence, DATA / name)
-        for row, mean, _ in ablate(source, references, rows=rows, params=params, config=config):
+        for row, mean, *_ in ablate(source, references, rows=rows, params=params, config=config):
             kept = {"psnr": round(mean.psnr, 3), "relmse": round(mean.relmse, 6), "temporal": round(mean.temporal, 5)}
             save(base, name, row.name, kept)
 
