@@ -4,6 +4,9 @@
 "temporal" (as in CUDA-Path-Tracer-Denoising) never does: a constant without history, a multiple of M2 - M1^2 with it.
 """
 
+from functools import reduce
+from itertools import cycle
+
 import jax.numpy as jnp
 from jax import Array
 
@@ -37,7 +40,7 @@ def estimate_variance(
     Args:
         moments: `[S, H, W, 2]`, accumulated M1 and M2 of the luminance.
         history_length: `[H, W]`, h.
-        frame: sanitised; its normal, depth and object_id guide the estimate.
+        frame: sanitised; its normal, depth and object_id guide the estimate; a signal's h is its longest_history at most.
         params: per-level leaves are read at entry 0.
         config: its `variance` says where which of the two is taken: "svgf" as above; "spatial": 7 x 7 everywhere; "temporal":
             initial_variance without history, else variance_scale * max(0, M2 - M1^2).
@@ -49,9 +52,12 @@ def estimate_variance(
     scalars = at_level(params, 0)
     guides, surface = guides_of(frame), frame.object_id != -1
     measured = None if frame.variance is None else (frame.variance >= 0.0).all(axis=0)
+    lengths = (history_length,)  # one for all signals, or one each
+    if frame.longest_history is not None:
+        lengths = tuple(jnp.minimum(history_length, longest) for longest in frame.longest_history)
     if config.variance == "temporal":
-        return _temporal_only(moments, history_length, surface, measured, scalars)
-    short = surface & ((history_length < SHORT_HISTORY) | (config.variance == "spatial"))
+        return _temporal_only(moments, lengths, surface, measured, scalars)
+    shorts = tuple(surface & ((length < SHORT_HISTORY) | (config.variance == "spatial")) for length in lengths)
     slope = depth_gradient(frame.depth, frame.object_id)
     signals = own = tuple(planes(signal) for signal in moments)
     known = None if measured is None else add_up(measured) > 0
@@ -101,32 +107,35 @@ def estimate_variance(
         offsets=offsets,
         per_tap=(jnp.asarray(steps[:, 0]), jnp.asarray(steps[:, 1])),
         sums=(zero, tuple((zero, zero) for _ in signals)),
-        where=short,
+        where=reduce(jnp.logical_or, shorts),
         strip_rows=strip_rows,
     )
 
-    def choose(around, signals, length, short, surface):
-        boost = jnp.maximum(1.0, scalars.short_history_boost / jnp.maximum(length, 1.0))
-        boost = boost if known is None else jnp.where(known, 1.0, boost)
-        chosen = (jnp.where(short, v * boost, _variance(m1, m2)) for v, (m1, m2) in zip(around, signals, strict=True))
-        return tuple(jnp.where(surface, v, 0.0) for v in chosen)
+    def choose(around, signals, lengths, shorts, surface):
+        chosen = []
+        for v, (m1, m2), length, short in zip(around, signals, cycle(lengths), cycle(shorts), strict=False):
+            boost = jnp.maximum(1.0, scalars.short_history_boost / jnp.maximum(length, 1.0))
+            boost = boost if known is None else jnp.where(known, 1.0, boost)
+            chosen.append(jnp.where(surface, jnp.where(short, v * boost, _variance(m1, m2)), 0.0))
+        return tuple(chosen)
 
-    return jnp.stack(in_strips(choose, spatial, own, history_length, short, surface))
+    return jnp.stack(in_strips(choose, spatial, own, lengths, shorts, surface))
 
 
 def _temporal_only(
-    moments: Array, history_length: Array, surface: Array, measured: Array | None, scalars: Params
+    moments: Array, lengths: tuple[Array, ...], surface: Array, measured: Array | None, scalars: Params
 ) -> Array:
-    def choose(signals, length, surface, measured):
-        new = length < _NO_HISTORY
-        new = new if measured is None else new & ~measured
-        chosen = (
-            jnp.where(new, scalars.initial_variance, scalars.variance_scale * _variance(m1, m2)) for m1, m2 in signals
-        )
-        return tuple(jnp.where(surface, v, 0.0) for v in chosen)
+    def choose(signals, lengths, surface, measured):
+        chosen = []
+        for (m1, m2), length in zip(signals, cycle(lengths), strict=False):
+            new = length < _NO_HISTORY
+            new = new if measured is None else new & ~measured
+            v = jnp.where(new, scalars.initial_variance, scalars.variance_scale * _variance(m1, m2))
+            chosen.append(jnp.where(surface, v, 0.0))
+        return tuple(chosen)
 
     signals = tuple(planes(signal) for signal in moments)
-    return jnp.stack(in_strips(choose, signals, history_length, surface, measured))
+    return jnp.stack(in_strips(choose, signals, lengths, surface, measured))
 
 
 def _variance(first: Array, second: Array) -> Array:

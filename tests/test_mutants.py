@@ -191,7 +191,7 @@ MUTANTS = {
         "test_estimate_variance_otherwise", "temporal",
     ),
     "spatial only while history is short": mutant(
-        "variance", "((history_length < SHORT_HISTORY) | (config.variance == \"spatial\"))", "(history_length < SHORT_HISTORY)",
+        "variance", "((length < SHORT_HISTORY) | (config.variance == \"spatial\"))", "(length < SHORT_HISTORY)",
         "test_estimate_variance_otherwise", "spatial",
     ),
     # A-trous

@@ -205,3 +205,20 @@ def test_some_but_not_all_of_the_reflections_fields_are_an_error():
     frame = frames_of_a_mirror()[0]
     with pytest.raises(sj.SvgfError, match="of reflections there is"):
         sj.init(frame._replace(longest_history=None))
+
+
+def test_the_variance_of_a_signal_whose_history_is_not_worth_keeping_is_that_of_its_surroundings():
+    """As if the history were that short; the moments of one frame have no variance of their own."""
+    rng = np.random.default_rng(1)
+    longest = np.stack([np.full((HEIGHT, WIDTH), n) for n in (1e6, 2.0)])
+    moments, length = rng.random((2, HEIGHT, WIDTH, 2)), np.full((HEIGHT, WIDTH), 9.0)
+    frame = bridge.to_frame(scenes.flat(HEIGHT, WIDTH, signals=2))
+    without = frame._replace(longest_history=np.full_like(longest, 1e6))  # one program for both
+    for variance in ("svgf", "temporal"):
+        config = Config(variance=variance)
+        estimate = jax.jit(lambda *a, config=config: sj.estimate_variance(*a, params=sj.Params(), config=config))
+        for most in (longest, longest / 2):
+            got = estimate(moments, length, frame._replace(longest_history=most))
+            for s in (0, 1):
+                wanted = estimate(moments, np.minimum(length, most[s]), without)[s]
+                np.testing.assert_allclose(got[s], wanted, rtol=1e-12)
