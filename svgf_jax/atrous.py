@@ -7,10 +7,20 @@ from jax import Array, lax
 
 from svgf_jax.color import luminance_of_planes
 from svgf_jax.edges import Guides, depth_gradient, geometry_exponent, guides_of, luminance_scale
-from svgf_jax.sampling import BY_WIDTH, planes, square_offsets, stack_planes, sum_over_taps
+from svgf_jax.sampling import (
+    BY_WIDTH,
+    add_margin,
+    cut_margin,
+    offsets_around,
+    planes,
+    renew_margin,
+    square_offsets,
+    stack_planes,
+    sum_over_taps,
+)
 from svgf_jax.types import Config, Frame, Params, at_level
 
-_OFFSETS = square_offsets(2)
+_OFFSETS = offsets_around(2)
 
 
 def atrous_filter(
@@ -36,28 +46,30 @@ def atrous_filter(
     """
     if config.levels == 0:
         return illumination, variance, illumination
-    guides, slope = guides_of(frame), depth_gradient(frame.depth, frame.object_id)
+    margin = 2 * 2 ** (config.levels - 1)  # kept from level to level: without, each would copy every plane
+    geometry = guides_of(frame), depth_gradient(frame.depth, frame.object_id)
+    guides, slope = add_margin(geometry, margin, margin)
     levels = range(config.levels)
     fed_back = config.feedback_level if config.feedback_level < config.levels else config.levels - 1
 
     def filter_level(state, level):
         (colors, variances, feedback), (scalars, step_size, feeds_back) = state, level
         colors, variances = _filter_planes(
-            colors,
-            variances,
+            *renew_margin((colors, variances), margin),
             guides,
             slope,
             scalars=scalars,
             step_size=step_size,
-            largest_step=2 ** (config.levels - 1),
+            margin=margin,
             prefilter=config.prefilter,
             strip_rows=strip_rows,
         )
         feedback = jax.tree.map(lambda new, old: jnp.where(feeds_back, new, old), colors, feedback)
         return (colors, variances, feedback), None
 
-    colors = tuple(planes(signal) for signal in illumination)
-    state = (colors, tuple(variance), colors)
+    given = tuple(planes(signal) for signal in illumination), tuple(variance)
+    colors, variances = jax.tree.map(lambda a: jnp.pad(a, margin), given)
+    state = (colors, variances, colors)
     if strip_rows is None:
         for i in levels:
             state, _ = filter_level(state, (at_level(params, i), 2**i, i == fed_back))
@@ -65,7 +77,7 @@ def atrous_filter(
         scalars = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (config.levels,)), params)
         steps, feeds_back = jnp.asarray([2**i for i in levels], jnp.int32), jnp.asarray([i == fed_back for i in levels])
         state, _ = lax.scan(filter_level, state, (scalars, steps, feeds_back))
-    colors, variances, feedback = state
+    colors, variances, feedback = cut_margin(state, margin)
     return stack_planes(colors), jnp.stack(variances), stack_planes(feedback)
 
 
@@ -83,17 +95,18 @@ def atrous_level(
 
     A zero sum of weights keeps the pixel. Shapes as in `atrous_filter`; `prefilter` as in `Config`.
     """
-    colors, variances = _filter_planes(
-        tuple(planes(signal) for signal in illumination),
-        tuple(variance),
-        guides_of(frame),
-        depth_gradient(frame.depth, frame.object_id),
+    margin = 2 * 2**level
+    light = tuple(planes(signal) for signal in illumination), tuple(variance)
+    geometry = guides_of(frame), depth_gradient(frame.depth, frame.object_id)
+    wide = _filter_planes(
+        *add_margin((*light, *geometry), margin, margin),
         scalars=at_level(params, level),
         step_size=2**level,
-        largest_step=2**level,
+        margin=margin,
         prefilter=prefilter,
         strip_rows=strip_rows,
     )
+    colors, variances = cut_margin(wide, margin)
     return stack_planes(colors), jnp.stack(variances)
 
 
@@ -105,14 +118,16 @@ def _filter_planes(
     *,
     scalars: Params,
     step_size: int | Array,
-    largest_step: int,
+    margin: int,
     prefilter: bool,
     strip_rows: int | None,
 ) -> tuple[tuple[tuple[Array, ...], ...], tuple[Array, ...]]:
-    """`atrous_level` on planes: S colours of three, S variances; `slope` is grad z."""
+    """`atrous_level` on planes with a margin: S colours of three, S variances; `slope` is grad z."""
     dtype = guides.depth.dtype
     lumas = tuple(luminance_of_planes(*color) for color in colors)
-    prefiltered = prefilter_variance(variances, guides.surface, strip_rows=strip_rows) if prefilter else variances
+    prefiltered = variances
+    if prefilter:
+        prefiltered = prefilter_variance(variances, guides.surface, margin=margin, strip_rows=strip_rows)
     scales = tuple(
         luminance_scale(v, sigma_luminance=scalars.sigma_luminance, luminance_epsilon=scalars.luminance_epsilon)
         for v in prefiltered
@@ -122,27 +137,37 @@ def _filter_planes(
     kernel = jnp.concatenate([kernel, kernel[1::-1]])  # (far, near, 1, near, far)
     steps = jnp.asarray(_OFFSETS, dtype) * jnp.asarray(step_size, dtype)
 
-    def tap(sums, q, p, t):
-        distance_y, distance_x, h = t
-        geometry = geometry_exponent(
+    def geometry(p, q, depth_change):
+        return geometry_exponent(
             p["guides"],
             q["guides"],
-            p["slope"][0] * distance_x + p["slope"][1] * distance_y,
+            depth_change,
             sigma_depth=scalars.sigma_depth,
             sigma_normal=scalars.sigma_normal,
             depth_epsilon=scalars.depth_epsilon,
         )
+
+    def tap(sums, q, p, t):
+        distance_y, distance_x, h = t
+        exponent = geometry(p, q, p["slope"][0] * distance_x + p["slope"][1] * distance_y)
         kernel_weight = h * q["guides"].surface
         return tuple(
             _add_tap(
                 total,
-                kernel_weight * jnp.exp(geometry - jnp.abs(luma_p - luma_q) * scale),
+                kernel_weight * jnp.exp(exponent - jnp.abs(luma_p - luma_q) * scale),
                 color,
                 value,
             )
             for total, color, value, luma_p, luma_q, scale in zip(
                 sums, q["color"], q["variance"], p["luma"], q["luma"], p["scale"], strict=True
             )
+        )
+
+    def alone(p):
+        weight = kernel[2] * kernel[2] * p["guides"].surface * jnp.exp(geometry(p, p, zero))
+        return tuple(
+            _add_tap((zero, (zero, zero, zero), zero), weight, color, value)
+            for color, value in zip(p["color"], p["variance"], strict=True)
         )
 
     def finish(sums, p):
@@ -159,9 +184,9 @@ def _filter_planes(
         centre={**neighbours, "slope": slope, "scale": scales},
         offsets=_OFFSETS,
         step_size=step_size,
-        largest_step=largest_step,
-        per_tap=(steps[:, 0], steps[:, 1], jnp.outer(kernel, kernel).reshape(-1)),
-        sums=tuple((zero, (zero, zero, zero), zero) for _ in colors),
+        margin=margin,
+        per_tap=(steps[:, 0], steps[:, 1], kernel[_OFFSETS[:, 0] + 2] * kernel[_OFFSETS[:, 1] + 2]),
+        sums=alone,
         strip_rows=strip_rows,
     )
     return tuple(color for color, _ in results), tuple(value for _, value in results)
@@ -182,9 +207,12 @@ def _normalise(total, color: tuple[Array, ...], variance: Array):
 
 
 def prefilter_variance(
-    variances: tuple[Array, ...], surface: Array, *, strip_rows: int | None = BY_WIDTH
+    variances: tuple[Array, ...], surface: Array, *, margin: int = 0, strip_rows: int | None = BY_WIDTH
 ) -> tuple[Array, ...]:
-    """g: the 3 x 3 Gaussian (1/4, 1/8, 1/16) of variance planes `[H, W]`, renormalised over the taps with a surface."""
+    """g: the 3 x 3 Gaussian (1/4, 1/8, 1/16) of variance planes `[H, W]`, renormalised over the taps with a surface.
+
+    `margin` is the planes', as for `sum_over_taps`.
+    """
     kernel = np.outer([0.25, 0.5, 0.25], [0.25, 0.5, 0.25]).reshape(-1)
 
     def tap(sums, q, p, h):
@@ -206,5 +234,6 @@ def prefilter_variance(
         offsets=square_offsets(1),
         per_tap=jnp.asarray(kernel, surface.dtype),
         sums=(zero, jax.tree.map(lambda _: zero, variances)),
+        margin=margin,
         strip_rows=strip_rows,
     )

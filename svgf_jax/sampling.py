@@ -71,6 +71,17 @@ def add_margin(image: Planes, rows: int, columns: int) -> Planes:
     return tree.unflatten(jnp.pad(a, ((0, 0), (columns, columns))) for a in taller)
 
 
+def cut_margin(image: Planes, margin: int) -> Planes:
+    """Planes without the margin that they have on every side."""
+    return jax.tree.map(lambda a: a[margin : a.shape[0] - margin, margin : a.shape[1] - margin], image)
+
+
+def renew_margin(image: Planes, margin: int) -> Planes:
+    """Planes whose margin is 0 with what belongs there: the rows of the other devices, if there are any."""
+    axis, _, _ = _division(jax.tree.leaves(image)[0])
+    return image if axis is None else add_margin(cut_margin(image, margin), margin, margin)
+
+
 def place(plane: Array) -> tuple[int | Array, int]:
     """The number of the plane's first row in the image, and the image's height."""
     axis, _, height = _division(plane)
@@ -142,6 +153,12 @@ def square_offsets(radius: int, step_size: int = 1) -> np.ndarray:
     return np.stack(np.meshgrid(reach, reach, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
+def offsets_around(radius: int) -> np.ndarray:
+    """The same without the centre, for sums that start from it."""
+    offsets = square_offsets(radius)
+    return offsets[offsets.any(axis=1)]
+
+
 def sum_over_taps(
     tap: Callable[[Sums, Any, Any, Any], Sums],
     finish: Callable[[Sums, Any], Planes],
@@ -150,11 +167,12 @@ def sum_over_taps(
     centre: Planes,
     offsets: np.ndarray,
     per_tap: Any = (),
-    sums: Sums,
+    sums: Sums | Callable[[Any], Sums],
     where: Array | None = None,
     step_size: int | Array = 1,
     largest_step: int = 1,
     strip_rows: int | None = BY_WIDTH,
+    margin: int = 0,
 ) -> Planes:
     """Run a stencil: for every pixel p, add up what `tap` makes of each neighbour q, then `finish` the sums.
 
@@ -168,30 +186,31 @@ def sum_over_taps(
         centre: planes `[H, W]` read at the pixel itself.
         offsets: `[n, 2]` integers (dy, dx), in steps.
         per_tap: tree of `[n, ...]` arrays, one entry a tap.
-        sums: tree of scalars, the sums' start (usually zeros).
+        sums: tree of scalars, the sums' start (usually zeros); or `sums(p)`, planes: what the centre alone gives.
         where: `[H, W]` bool; a strip without a True is not computed and its result is 0. None = everywhere.
         step_size: pixels per step, an integer; may be traced (a loop over levels then compiles once) unless strip_rows is None.
         largest_step: the largest value step_size may take.
         strip_rows: rows per strip, `BY_WIDTH`; None = no strips and no loop, the plain form that the other is tested against.
+        margin: of all planes that are given (but `where`) and returned, as far as any tap reaches; those returned have 0 there.
+            `renew_margin` brings it up to date. 0 = they have none: the neighbours get one, which takes a copy of each.
 
     Returns:
         The tree that `finish` returns, with leaves `[H, W]`.
     """
-    height, width = jax.tree.leaves(centre)[0].shape
-    top, left = (int(r) * largest_step for r in np.abs(offsets).max(axis=0))
-
+    reach = [int(r) * largest_step for r in np.abs(offsets).max(axis=0)]
     if strip_rows is None:
-        totals = jax.tree.map(lambda s: jnp.full((height, width), s), sums)
+        neighbours, centre = cut_margin((neighbours, centre), margin)
+        totals = _start(sums, centre)
         for i, (dy, dx) in enumerate(offsets * step_size):
             q = jax.tree.map(lambda a, dy=int(dy), dx=int(dx): shift(a, dy, dx), neighbours)
             totals = tap(totals, q, centre, jax.tree.map(lambda a, i=i: a[i], per_tap))
-        return finish(totals, centre)
+        return jax.tree.map(lambda a: jnp.pad(a, margin), finish(totals, centre))
 
+    height, width = (n - 2 * margin for n in jax.tree.leaves(centre)[0].shape)
     count, rows = split_rows(height, width, strip_rows)
-    below = count * rows - height
     unroll = len(offsets) if unroll_taps(height, width, len(offsets)) else 1
-    padded = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), add_margin(neighbours, top, left))
-    centred = jax.tree.map(lambda a: jnp.pad(a, ((0, below), (0, 0))), (centre, where))
+    top, left = (margin, margin) if margin else reach
+    wide = neighbours if margin else add_margin(neighbours, top, left)
     corners = jnp.asarray(offsets) * jnp.asarray(step_size, jnp.int32) + jnp.array([[top, left]], jnp.int32)
 
     def compute(window: Planes, p: Planes) -> Planes:
@@ -200,25 +219,40 @@ def sum_over_taps(
             q = jax.tree.map(lambda a: lax.dynamic_slice(a, (corner[0], corner[1]), (rows, width)), window)
             return tap(totals, q, p, t), None
 
-        start = jax.tree.map(lambda s: jnp.full((rows, width), s), sums)
-        totals, _ = lax.scan(body, start, (corners, per_tap), unroll=unroll)
+        totals, _ = lax.scan(body, _start(sums, p), (corners, per_tap), unroll=unroll)
         return finish(totals, p)
 
-    def strip(first_row: Array) -> Planes:
+    def strip(wide: Planes, centre: Planes, where: Array | None, first_row: Array) -> Planes:
         zero = jnp.zeros_like(first_row)
         window = jax.tree.map(
-            lambda a: lax.dynamic_slice(a, (first_row, zero), (rows + 2 * top, width + 2 * left)), padded
+            lambda a: lax.dynamic_slice(a, (first_row, zero), (rows + 2 * top, width + 2 * left)), wide
         )
-        p, wanted = jax.tree.map(lambda a: lax.dynamic_slice(a, (first_row, zero), (rows, width)), centred)
-        if wanted is None:
+        p = jax.tree.map(lambda a: lax.dynamic_slice(a, (first_row + margin, zero + margin), (rows, width)), centre)
+        if where is None:
             return compute(window, p)
+        wanted = lax.dynamic_slice(where, (first_row, zero), (rows, width))
         shape = jax.eval_shape(compute, window, p)
         nothing = lambda *_: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shape)  # noqa: E731
         return lax.cond(jnp.any(wanted), compute, nothing, window, p)
 
     strip = jax.checkpoint(strip, prevent_cse=False)  # type: ignore[assignment]
-    result = lax.map(strip, jnp.arange(count, dtype=jnp.int32) * rows)
-    return jax.tree.map(lambda a: a.reshape(count * rows, width)[:height], result)
+
+    def put(results: Planes, first_row: Array) -> tuple[Planes, None]:
+        at = (first_row + margin, jnp.full_like(first_row, margin))
+        found = strip(wide, centre, where, first_row)
+        return jax.tree.map(lambda a, b: lax.dynamic_update_slice(a, b, at), results, found), None
+
+    first_rows = jnp.minimum(jnp.arange(count, dtype=jnp.int32) * rows, height - rows)  # the last two may overlap
+    shapes = jax.eval_shape(strip, wide, centre, where, first_rows[0])
+    start = jax.tree.map(lambda s: jnp.zeros((height + 2 * margin, width + 2 * margin), s.dtype), shapes)
+    return lax.scan(put, start, first_rows)[0]
+
+
+def _start(sums: Sums | Callable[[Any], Sums], p: Planes) -> Sums:
+    if callable(sums):
+        return sums(p)
+    shape = jax.tree.leaves(p)[0].shape
+    return jax.tree.map(lambda s: jnp.full(shape, s), sums)
 
 
 def map_strips(function: Callable[[Any], Planes], strips: Any) -> Planes:

@@ -14,7 +14,7 @@ from jax import Array, lax
 from svgf_jax.cells import Color
 from svgf_jax.color import luminance_of_planes
 from svgf_jax.edges import NEVER, Guides, geometry_exponent
-from svgf_jax.sampling import in_strips, square_offsets, sum_over_taps
+from svgf_jax.sampling import add_margin, cut_margin, in_strips, renew_margin, square_offsets, sum_over_taps
 from svgf_jax.types import Params
 
 GAIN_LEVELS = 4  # a-trous levels on the grid of cells: reach of +-15 cells
@@ -187,6 +187,8 @@ def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, s
     """Sums over ever wider neighbourhoods of cells: of the weights, of their squares, and of `sums`."""
     kernel = np.outer(_KERNEL, _KERNEL).reshape(-1)
     away = jnp.asarray(_OFFSETS * size, cells.weight.dtype)
+    margin = 2 ** (levels - 1)
+    guides, slope, state = add_margin((cells.guides, cells.slope, (cells.weight, cells.square, sums)), margin, margin)
 
     def tap(sums, q, p, t):
         dy, dx, log_h = t
@@ -206,16 +208,16 @@ def _pool(cells: Cells, sums: tuple[Compared, ...], *, levels: int, size: int, s
         return sum_over_taps(
             tap,
             lambda sums, p: sums,
-            neighbours={"guides": cells.guides, "state": state},
-            centre={"guides": cells.guides, "slope": cells.slope},
+            neighbours={"guides": guides, "state": renew_margin(state, margin)},
+            centre={"guides": guides, "slope": slope},
             offsets=_OFFSETS,
             per_tap=(distance[:, 0], distance[:, 1], jnp.asarray(np.log(kernel), away.dtype)),
             sums=jax.tree.map(lambda a: jnp.zeros((), a.dtype), state),
             step_size=step_size,
-            largest_step=2 ** (levels - 1),
+            margin=margin,
         ), None
 
-    return lax.scan(level, (cells.weight, cells.square, sums), 2 ** jnp.arange(levels, dtype=jnp.int32))[0]
+    return cut_margin(lax.scan(level, state, 2 ** jnp.arange(levels, dtype=jnp.int32))[0], margin)
 
 
 def _means(

@@ -35,10 +35,8 @@ def mutant(module, old, new, caught_by, *arguments):
     return Mutant(module, ((old, new),), caught_by, arguments)
 
 
-SLOPE = """            p["slope"][0] * distance_x + p["slope"][1] * distance_y,"""
-ISOTROPIC = (
-    """            jnp.maximum(jnp.abs(p["slope"][0]), jnp.abs(p["slope"][1])) * jnp.hypot(distance_x, distance_y),"""
-)
+SLOPE = """p["slope"][0] * distance_x + p["slope"][1] * distance_y)"""
+ISOTROPIC = """jnp.maximum(jnp.abs(p["slope"][0]), jnp.abs(p["slope"][1])) * jnp.hypot(distance_x, distance_y))"""
 
 MUTANTS = {
     # Temporal accumulation
@@ -198,7 +196,7 @@ MUTANTS = {
     "variance divided by the sum of squared weights": Mutant(
         "atrous",
         (
-            ("sums=tuple((zero, (zero, zero, zero), zero) for", "sums=tuple((zero, (zero, zero, zero), (zero, zero)) for"),
+            ("_add_tap((zero, (zero, zero, zero), zero), weight", "_add_tap((zero, (zero, zero, zero), (zero, zero)), weight"),
             ("variances + weight * (weight * variance)", "(variances[0] + weight**2 * variance, variances[1] + weight**2)"),
             ("variances / divisor / divisor", "variances[0] / jnp.maximum(variances[1], 1e-30)"),
         ),
@@ -220,12 +218,11 @@ MUTANTS = {
         "test_atrous_level", 0,
     ),
     "no variance blur": mutant(
-        "atrous", "prefiltered = prefilter_variance(variances, guides.surface, strip_rows=strip_rows)",
+        "atrous", "prefiltered = prefilter_variance(variances, guides.surface, margin=margin, strip_rows=strip_rows)",
         "prefiltered = variances", "test_atrous_level", 0,
     ),
     "variance blurred though not asked for": mutant(
-        "atrous", "strip_rows=strip_rows) if prefilter else variances", "strip_rows=strip_rows)",
-        "test_atrous_level_without_prefilter",
+        "atrous", "if prefilter:", "if True:", "test_atrous_level_without_prefilter"
     ),
     "blurred variance handed on": mutant(
         "atrous", "\"variance\": variances, \"luma\"", "\"variance\": prefiltered, \"luma\"", "test_atrous_level", 0
@@ -234,6 +231,9 @@ MUTANTS = {
     "slope not scaled with the step": mutant(
         "atrous", "jnp.asarray(_OFFSETS, dtype) * jnp.asarray(step_size, dtype)", "jnp.asarray(_OFFSETS, dtype)",
         "test_atrous_level", 1,
+    ),
+    "the pixel itself forgotten": mutant(
+        "atrous", "weight = kernel[2] * kernel[2] * p", "weight = 0.0 * p", "test_atrous_level", 0
     ),
     "centre weight zero": mutant(
         "atrous", "scalars.kernel_near, 1.0)", "scalars.kernel_near, 0.0)", "test_atrous_level", 0
@@ -247,7 +247,7 @@ MUTANTS = {
         (
             ("            strip_rows=strip_rows,\n        )\n        feedback",
              "            strip_rows=strip_rows,\n            first=first,\n        )\n        feedback"),
-            ("    state = (colors, tuple(variance), colors)", "    state = (colors, tuple(variance), colors)\n    first = colors"),
+            ("    state = (colors, variances, colors)", "    state = (colors, variances, colors)\n    first = colors"),
             ("    strip_rows: int | None,\n) ->", "    strip_rows: int | None,\n    first=None,\n) ->"),
             ("(*color) for color in colors)", "(*color) for color in first or colors)"),
         ),
