@@ -54,8 +54,10 @@ def atrous_filter(
 
     def filter_level(state, level):
         (colors, variances, feedback), (scalars, step_size, feeds_back) = state, level
+        colors, variances = renew_margin((colors, variances), margin)
         colors, variances = _filter_planes(
-            *renew_margin((colors, variances), margin),
+            colors,
+            variances,
             guides,
             slope,
             scalars=scalars,
@@ -98,8 +100,12 @@ def atrous_level(
     margin = 2 * 2**level
     light = tuple(planes(signal) for signal in illumination), tuple(variance)
     geometry = guides_of(frame), depth_gradient(frame.depth, frame.object_id)
+    colors, variances, guides, slope = add_margin((*light, *geometry), margin, margin)
     wide = _filter_planes(
-        *add_margin((*light, *geometry), margin, margin),
+        colors,
+        variances,
+        guides,
+        slope,
         scalars=at_level(params, level),
         step_size=2**level,
         margin=margin,

@@ -248,7 +248,7 @@ def sum_over_taps(
     return lax.scan(put, start, first_rows)[0]
 
 
-def _start(sums: Sums | Callable[[Any], Sums], p: Planes) -> Sums:
+def _start(sums: Any, p: Planes) -> Any:
     if callable(sums):
         return sums(p)
     shape = jax.tree.leaves(p)[0].shape

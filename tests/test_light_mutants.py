@@ -240,10 +240,10 @@ CHECKS = {
     },
     check_mirror: {
         "seen from the origin": ("away = position - _eye(camera)", "away = position - 0.0"),
-        "seen by this frame's camera": ("_screen(before, was + behind", "_screen(camera, was + behind"),
-        "in front of the mirror": ("motion = _screen(before, was + behind", "motion = _screen(before, was - behind"),
+        "seen by this frame's camera": ("motion = _screen(before, image)", "motion = _screen(camera, image)"),
+        "in front of the mirror": ("image = was + _moved(", "image = was - _moved("),
         "depth of the surface for that of the mirror there": (
-            "_depth_along(before, was, was + behind[..., None] * away,", "_depth_along(before, was, was,",
+            "_depth_along(before, was, image,", "_depth_along(before, was, was,",
         ),
         "history shortened in mirrors": ("drift = (1.0 - share) * np.hypot", "drift = np.hypot"),
     },
