@@ -118,4 +118,4 @@ if __name__ == "__main__":
     if sys.argv[1:] == ["readings"]:
         print(json.dumps(readings()))
     else:
-        print(json.dumps({"adaptive": steps("adaptive", 3, (21, 11), frames=2, changes=[("levels", 1)])}))
+        print(json.dumps({"adaptive": steps("adaptive", 3, (21, 11), frames=2, changes=[("levels", 2)])}))
