@@ -19,12 +19,14 @@ from PIL import Image
 from svgf_jax import Params, exr, init, open_source, preset, read_frame, step
 from svgf_jax.metrics import display
 
-VARIANTS = {  # preset, with the channel `hit_distance`, other parameters
-    "`paper`, surface": ("paper", False, {}),
-    "`paper`, hit distance": ("paper", True, {}),
-    "`adaptive`, surface": ("adaptive", False, {}),
-    "`adaptive`, hit distance": ("adaptive", True, {}),
-    "the same, `sigma_luminance` 2": ("adaptive", True, {"sigma_luminance": 2.0}),
+VARIANTS = {  # preset, with the channel `hit_distance`, table, other parameters
+    "`paper`, surface": ("paper", False, "table", {}),
+    "`paper`, hit distance": ("paper", True, "table", {}),
+    "`paper`, hit distance, mirrored albedo": ("paper", True, "mirrored", {}),
+    "`adaptive`, surface": ("adaptive", False, "table", {}),
+    "`adaptive`, hit distance": ("adaptive", True, "table", {}),
+    "the same, `sigma_luminance` 2": ("adaptive", True, "table", {"sigma_luminance": 2.0}),
+    "the same, mirrored albedo": ("adaptive", True, "mirrored", {"sigma_luminance": 2.0}),
 }
 PARTS = ("mirror", "lacquer", "rough", "gold", "glazed")
 MOVING = ("ball", "box")
@@ -32,13 +34,13 @@ MOVING = ("ball", "box")
 
 CROP, SHOWN = (
     (slice(60, 180), slice(0, 200)),
-    ("`paper`, surface", "`paper`, hit distance", "the same, `sigma_luminance` 2"),
+    ("`paper`, surface", "`paper`, hit distance", "`paper`, hit distance, mirrored albedo"),
 )
 
 
-def filtered(folder: Path, name: str, hit: bool, changes: dict[str, float]) -> Iterator[np.ndarray]:
+def filtered(folder: Path, name: str, hit: bool, table: str, changes: dict[str, float]) -> Iterator[np.ndarray]:
     without = {} if hit else {"hit_distance": ("none",)}
-    source = open_source(folder, renderer=str(folder / "table.toml"), channel=without)
+    source = open_source(folder, renderer=str(folder / f"{table}.toml"), channel=without)
     params, config = preset(name)
     leaves = Params(*(np.asarray(leaf, np.float32) for leaf in params._replace(**changes)))
     history = None

@@ -12,7 +12,8 @@ A frame is native: direct, indirect, emission, albedo, normal, depth, motion, id
 free of noise. direct = emitted light and one bounce by next event estimation and BSDF sampling, indirect = two bounces more.
 
 `mirror` has instead diffuse_direct, diffuse_indirect and specular (what glossy lobes show, up to four bounces), with `albedo`,
-`specular_albedo`, `roughness` and `hit_distance`, as long as this sample's ray is; `table.toml` names them. The references of
+`specular_albedo`, `roughness` and `hit_distance`, as long as this sample's ray is; `table.toml` names them. `mirrored.toml` has as
+albedo of specular light `mirrored_albedo`, which is times the albedo of what smooth surfaces mirror. The references of
 `mirror` hold besides: `id`, and `reflected.id`, of what a perfect mirror would show there (-1 on matt surfaces); their attribute
 `shapes` names the ids from 0 on.
 """
@@ -257,6 +258,28 @@ def gloss(scene, rays, names, ids, width, height):
     return albedo, np.where(matt, 1.0, roughness), metals, np.where(matt, -1.0, reflected)
 
 
+def mirrored(scene, rays, names, ids, albedo, width, height):
+    """The albedo of what reflects times that of what is seen in it, where it is smooth; 1 for what emits."""
+    smooth = [name for name, (rough, _) in GLOSS.items() if not rough]
+    alive = np.isin(ids, [names.index(name) for name in smooth])
+    si, found, weight = scene.ray_intersect(rays), albedo.copy(), albedo.copy()
+    for _ in range(3):
+        si = scene.ray_intersect(si.spawn_ray(si.to_world(mi.reflect(si.wi))))
+        seen = shape_ids(scene, si, names, width, height)
+        shown = np.array(si.bsdf().eval_diffuse_reflectance(si)).T.reshape(height, width, 3)
+        shown[np.isin(seen, [names.index("panel"), names.index("lamp")])] = 1
+        again = np.zeros(ids.shape, bool)
+        for name, (rough, color) in GLOSS.items():
+            mine = seen == names.index(name)
+            if color is not None:
+                shown[mine] = color
+                again |= mine & (not rough)
+        found[alive] = (weight * shown)[alive]
+        weight = np.where(again[..., None], weight * shown, weight)
+        alive &= again
+    return found
+
+
 def shape_ids(scene, si, names, width, height):
     ids = np.full((height, width), -1.0, np.float32)
     seen = np.array(dr.reinterpret_array(mi.UInt32, si.shape)).reshape(height, width)
@@ -324,7 +347,9 @@ def draw_glossy(folder, t, scene, names, one, many, layers, seeds, width, height
     *noisy, reach = glossy_radiance(scene, one, 2 * t, width, height, 1)
     kinds = ("diffuse_direct", "diffuse_indirect", "specular")
     light = {k: v for kind, image in zip(kinds, noisy, strict=True) for k, v in rgb(kind, image).items()}
-    layers |= rgb("specular_albedo", albedo) | {"roughness.Y": roughness, "hit_distance.Z": reach}
+    behind = mirrored(scene, one, names, ids, albedo, width, height)
+    layers |= rgb("specular_albedo", albedo) | rgb("mirrored_albedo", behind)
+    layers |= {"roughness.Y": roughness, "hit_distance.Z": reach}
     write(folder / f"frame_{t:04d}.exr", light | layers)
     clean = np.mean([np.sum(glossy_radiance(scene, many, s, width, height, WAVE)[:3], axis=0) for s in seeds], axis=0)
     clean += np.stack([layers[f"emission.{c}"] for c in "RGB"], -1)
@@ -332,6 +357,7 @@ def draw_glossy(folder, t, scene, names, one, many, layers, seeds, width, height
     told = {"spp": len(seeds) * WAVE, "shapes": " ".join(names)}
     write(folder / f"ref_{t:04d}.exr", beauty | {"id.I": ids, "reflected.id": reflected}, **told)
     (folder / "table.toml").write_text(TABLE)
+    (folder / "mirrored.toml").write_text(TABLE.replace("specular_albedo", "mirrored_albedo"))
 
 
 def render(name, folder, frames, spp, width, height):
