@@ -15,7 +15,7 @@ from svgf_jax.sampling import BY_WIDTH, in_strips, planes, stack_planes
 from svgf_jax.types import Config, Frame, Params, Reprojected, at_level
 from svgf_jax.windows import window_range
 
-_LEAST_WORTH = 1e-2  # frames; no history is noisier than a hundredth of one
+_LEAST_WORTH = 1e-2  # frames; of less, the quotient and its derivative would soon be infinite
 
 
 class Accumulated(NamedTuple):

@@ -18,9 +18,9 @@ remembers.
 
 Then, per pixel, from the four cells around it (bilinear, geometry weights): H' = max(0, g H + o), and the moments move with it:
 M1' = g M1 + o; the variance M2 - M1^2 scales with the square of the light and turns, as s rises, into the one just observed.
-A correction is noisy itself: the number n of frames that the history is worth becomes 1 / (r / n + sum of s^2 / effective number
-of samples), the sum over gain and offset; r >= 1 is the square of the light before the offset over that after it, since an
-offset lets the history's noise stay as it is while the light grows dimmer.
+A correction is noisy itself: of n frames that the history is worth remain 1 / (r (1 / n + s_g^2 / N_g) + s_o^2 / N_o), s and N
+being significance and effective number of samples of gain and offset; r >= 1 is the square of the light before the offset over
+that after it, since an offset leaves the history's noise as it is when it makes the light dimmer.
 Nothing here is in Schied et al. 2017; comparing means of filtered differences is the idea of A-SVGF (Schied et al. 2018), the test
 against their standard error is not.
 """
@@ -149,7 +149,7 @@ def _correct(color: Color, moments: tuple[Array, ...], worth: Array | None, c: C
     before, after = (jnp.minimum(luminance_of_planes(*rgb), most) for rgb in (color, corrected))
     change = (after - before) / jnp.maximum(jnp.maximum(after, before), TINY)
     if worth is not None:
-        worth = worth / (offset.dimmed + worth * offset.noise)
+        worth = worth / jnp.maximum(offset.dimmed + worth * offset.noise, 1.0)  # less only where no cell was found
     return corrected, (first, variance + first * first), change, worth
 
 

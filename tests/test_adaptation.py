@@ -311,10 +311,12 @@ def test_it_is_differentiable_in_its_parameters_and_the_history():
         first = jnp.minimum(past[..., 0], 1e150)
         moments = jnp.stack([first, first**2], axis=-1)
         known = jnp.asarray(np.arange(18)[None] != np.arange(17)[:, None])
-        previous = Reprojected(past, moments, jnp.full((17, 18), 3.0), known)
+        worth = 1.0 + jnp.log1p(first)
+        previous = Reprojected(past, moments, jnp.full((17, 18), 3.0), known, effective_history=worth)
         followed = follow_light(previous, frame.radiance, frame, params=params, config=Config(light_cell=4))
         lights = (followed.illumination, followed.moments)
-        return sum(jnp.sum(jnp.log1p(a)) + plain * jnp.sum(a) for a in lights) + jnp.sum(followed.change)
+        told = jnp.sum(followed.change) + jnp.sum(followed.effective_history)
+        return sum(jnp.sum(jnp.log1p(a)) + plain * jnp.sum(a) for a in lights) + told
 
     values = tuple(jnp.asarray(v, jnp.float64) for v in (1.0, 1.0, 64.0))
     gradient = jax.jit(jax.grad(error, argnums=(0, 1)))

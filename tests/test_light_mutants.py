@@ -110,7 +110,8 @@ def check_correction(module):
     color, first, noise = planes(8), RNG.gamma(1.0, 1.0, 8), RNG.gamma(1.0, 1.0, 8)
     gain, offset = planes(8), tuple(o - 2.0 for o in planes(8))
     luminance_gain, keep, variance = planes(8)
-    dimmed, added, worth = planes(8)
+    added, fewer, worth = planes(8)
+    dimmed = 1.0 + fewer  # below 1 it never is
     correction = judging.Correction(gain, luminance_gain, judging.Offset(offset, keep, variance, dimmed, added))
     got, moments, change, left = module._correct(color, (first, noise + first**2), worth, correction)
     wanted = [np.maximum(g * c + o, 0.0) for g, c, o in zip(gain, color, offset, strict=True)]
