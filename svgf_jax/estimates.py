@@ -36,12 +36,15 @@ def estimate(scan: Scan, *, pixels: int, signals: int, config: Any, options: Wri
     light = SECONDS_OF_LIGHT if getattr(config, "light_cell", 0) else 0.0
     seconds = pixels * (SECONDS + signals * (SECONDS_A_LEVEL * (levels + 2) + light))
     memory = BASE_MEMORY + pixels * (MEMORY + MEMORY_A_SIGNAL * signals)
-    return Estimate(seconds, memory, _disk(scan, pixels, signals, options))
+    return Estimate(seconds, memory, _disk(scan, pixels, signals, options, layers=3 if light else 2))
 
 
-def _disk(scan: Scan, pixels: int, signals: int, options: WriteOptions) -> float:
-    """The input's own layers as they are compressed there, and the new ones as if they did not compress at all."""
-    planes = 3 + (2 * signals + 2 if options.diagnostics else 0)
+def _disk(scan: Scan, pixels: int, signals: int, options: WriteOptions, *, layers: int) -> float:
+    """The input's own layers as they are compressed there, and the new ones as if they did not compress at all.
+
+    `layers` are the diagnostics of a signal.
+    """
+    planes = 3 + (layers * signals + 2 if options.diagnostics else 0)
     frames = len(scan.there)
     own = 0.0 if options.only_denoised else scan.stored / max(frames, 1)
     return frames * (own + pixels * planes * (4 if options.full_float else 2) + (pixels if options.png else 0))

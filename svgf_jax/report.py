@@ -107,6 +107,13 @@ def run_page(run: Run, summary: Summary, *, repairs: Callable[[Mapping[str, int]
             f"The filter's maps of frames {format_range(bare)} are unknown: an earlier run denoised them, and only --diagnostics "
             "keeps them in the files."
         )
+    known_maps = {frame.number: frame.maps.get("denoised", {}) for frame in shown}
+    lost = [n for n, maps in known_maps.items() if "history length" in maps and "effective history" not in maps]
+    if lost and summary.resumed_at and run.method == "svgf":
+        notes.append(
+            f"The effective history of frames {format_range(lost)} is unknown: a run keeps it only if it begins with --report or "
+            "--diagnostics."
+        )
     rows = [
         (number, one.get("status", UNKNOWN), *_score_cells(score), *_cells(times, count, mean))
         for number, one, score, times, count, mean in zip(x, known, scores, seconds, repaired, length, strict=True)
