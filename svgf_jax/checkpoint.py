@@ -253,8 +253,8 @@ def _check_arrays(history: History) -> None:
             raise ValueError(f"{name} is {array.dtype} {array.shape}")
         if not np.isfinite(array).all():
             raise ValueError(f"{name} is not finite")
-    counts = (history.history_length, history.effective_history, history.taa and history.taa.frames)
-    if any(frames is not None and np.any(frames < 0) for frames in counts):
+    counts = ("history_length", "effective_history", "taa.frames")
+    if any(np.any(array < 0) for name, array in _flat(history).items() if name in counts):
         raise ValueError("a history of fewer than 0 frames")
 
 

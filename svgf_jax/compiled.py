@@ -114,9 +114,10 @@ def _jitted(
         from svgf_jax.devices import step_over
 
         step = partial(cast(Any, step_over), devices=devices)
-    start = init  # other pipelines know nothing of these
-    start = partial(start, config=config) if getattr(config, "taa", False) else start
-    start = partial(start, effective_history=True) if effective_history else start
+    asked: dict[str, Any] = {"config": config} if getattr(config, "taa", False) else {}
+    if effective_history:
+        asked["effective_history"] = True
+    start = partial(init, **asked) if asked else init  # other pipelines know nothing of these
 
     def go(history: History, frame: Frame, params: Any) -> tuple[History, Output]:
         history, output = step(history, frame, params=params, config=config)

@@ -39,8 +39,8 @@ def init(frame: Frame, *, config: Config = Config(), effective_history: bool = F
         depth=jnp.zeros((height, width), dtype),
         normal=jnp.zeros((height, width, 3), dtype),
         object_id=jnp.full((height, width), -1, jnp.int32),
-        effective_history=jnp.zeros((signals, height, width), dtype) if effective_history else None,
         taa=taa_init(frame.emission) if config.taa else None,
+        effective_history=jnp.zeros((signals, height, width), dtype) if effective_history else None,
     )
 
 
@@ -95,8 +95,8 @@ def step(
         depth=frame.depth,
         normal=frame.normal,
         object_id=frame.object_id,
-        effective_history=worth,
         taa=past,
+        effective_history=worth,
     )
     return history, Output(
         image=image,

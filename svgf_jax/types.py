@@ -80,8 +80,8 @@ class History(NamedTuple):
         moments: `[S, H, W, 2]`, accumulated first and second moment of the illumination's luminance.
         history_length: `[H, W]`, frames accumulated, a real number in [0, max_history]; 0 = no history.
         depth, normal, object_id: the sanitised guides of the frame that this history ends with.
-        effective_history: `[S, H, W]`, as in `Output`; None = not kept; `init` is asked for it.
         taa: what temporal anti-aliasing remembers; None where `Config.taa` is off.
+        effective_history: `[S, H, W]`, as in `Output`; None = not kept; `init` is asked for it.
     """
 
     illumination: Array
@@ -90,8 +90,8 @@ class History(NamedTuple):
     depth: Array
     normal: Array
     object_id: Array
-    effective_history: Array | None = None
     taa: TaaHistory | None = None
+    effective_history: Array | None = None
 
 
 class Reprojected(NamedTuple):
@@ -102,16 +102,15 @@ class Reprojected(NamedTuple):
         moments: `[S, H, W, 2]`.
         history_length: `[H, W]`, a real number.
         valid: `[H, W]` bool, whether there is history.
-        effective_history: `[S, H, W]`, as in `Output`.
-        change: `[S, H, W]`, as in `Output`.
+        change, effective_history: `[S, H, W]`, as in `Output`.
     """
 
     illumination: Array
     moments: Array
     history_length: Array
     valid: Array
-    effective_history: Array | None = None
     change: Array | None = None
+    effective_history: Array | None = None
 
 
 class Rejected(NamedTuple):

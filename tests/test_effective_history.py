@@ -26,7 +26,7 @@ def case(rng):
     length = np.where(valid, rng.integers(2, 20, SHAPE[1:]), 1.0) * (ids != -1)
     worth = np.where(valid, rng.uniform(0.5, 9.0, SHAPE), 0.0)
     empty = np.zeros((*SHAPE, 3))
-    previous = Reprojected(empty, empty[..., :2], np.maximum(length - 1, 0), valid, worth)
+    previous = Reprojected(empty, empty[..., :2], np.maximum(length - 1, 0), valid, effective_history=worth)
     return frame._replace(object_id=ids), previous, length
 
 
@@ -85,7 +85,7 @@ def test_it_tells_the_noise_of_an_accumulated_wall(noise, factor):
         told.append(1 / np.mean(1 / np.asarray(output.effective_history)))
     assert told[0] == 1
     np.testing.assert_allclose(told, seen, rtol=0.13)
-    assert told[-1] > 0.9 * (2 - 0.35) / 0.35  # no adaptation: the mean's own limit
+    assert told[-1] > 0.9 * (2 - 0.35) / 0.35  # of what the mean over time alone is worth in the end
 
 
 def test_it_is_brought_along_like_the_light():
