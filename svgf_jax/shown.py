@@ -85,7 +85,7 @@ def diagnostics(
             largest = np.abs(signals).argmax(0)[None]
             found["change of light"] = page.signed(np.take_along_axis(signals, largest, axis=0)[0])
         if worth is not None:
-            found["effective history"] = page.heat(np.asarray(worth, np.float64).min(0) / _most_worth(params))
+            found["effective history"] = page.heat(np.asarray(worth, np.float64).min(0) / most_worth(params))
     return found
 
 
@@ -106,7 +106,7 @@ def legends(params: Mapping[str, Any] | None = None) -> dict[str, Legend]:
     """The maps, and what their colours mean."""
     return _LEGENDS | {
         "history length": Legend(HEAT, "0", f"{_longest(params or {}):g} frames"),
-        "effective history": Legend(HEAT, "0", f"worth {_most_worth(params or {}):.3g} frames"),
+        "effective history": Legend(HEAT, "0", f"worth {most_worth(params or {}):.3g} frames"),
     }
 
 
@@ -125,7 +125,7 @@ def _longest(params: Mapping[str, Any]) -> float:
     return float(np.max(params.get("max_history", 32.0)))
 
 
-def _most_worth(params: Mapping[str, Any]) -> float:
+def most_worth(params: Mapping[str, Any]) -> float:
     """How many frames a history is worth in the end, whose frames all weigh as much as the last."""
     alpha = max(float(np.ravel(params.get("alpha", 0.2))[0]), 1 / _longest(params))
     return (2 - alpha) / alpha

@@ -1,6 +1,6 @@
 """What following the light looks like beside the preset `paper`. (What it costs: speed.py step.)
 
-    python tests/bench/adaptive.py FOLDER OUT.png [--frames 11,12]     (reference, paper, adaptive, its change and its worth)
+    python tests/bench/adaptive.py FOLDER OUT.jpg [--frames 11,12]     (reference, paper, adaptive, its change and its worth)
 
 One row a frame; the change of the direct light, red = the history was made brighter, blue = darker, and how many frames its history
 is worth, bright = the most there may be, dark = none.
@@ -15,9 +15,9 @@ from PIL import Image
 
 import svgf_jax as sj
 from svgf_jax import page, preview
+from svgf_jax.shown import most_worth
 
 PRESETS = ("paper", "adaptive")
-MOST = (2 - 0.35) / 0.35  # frames that a mean with an alpha of .35 is worth
 
 
 def outputs(folder: str, name: str, wanted: list[int]) -> list[sj.Output]:
@@ -44,12 +44,12 @@ def halved(image: np.ndarray, factor: float = 1.5) -> np.ndarray:
 def pictures(folder: str, out: Path, frames: list[int]) -> None:
     references = list(sj.load_reference(folder))
     paper, adaptive = (outputs(folder, name, frames) for name in PRESETS)
-    rows = []
+    rows, most = [], most_worth(sj.preset("adaptive")[0]._asdict())
     for at, one, other in zip(frames, paper, adaptive, strict=True):
         shown = [preview.to_8bit(image) for image in (references[at], one.image, other.image)]
-        maps = page.signed(other.change[0]), page.heat(other.effective_history[0] / MOST)
+        maps = page.signed(other.change[0]), page.heat(other.effective_history[0] / most)
         rows.append(np.concatenate([halved(p) for p in (*shown, *maps)], axis=1))
-    Image.fromarray(np.concatenate(rows)).quantize(255).save(out, optimize=True)
+    Image.fromarray(np.concatenate(rows)).save(out, quality=90)
 
 
 def main() -> None:

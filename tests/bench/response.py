@@ -1,12 +1,14 @@
 """What following the light makes of steady light: false alarms, and fireflies close to each other.
 
-    python tests/bench/response.py [alarms] [fireflies]
+    python tests/bench/response.py [alarms] [fireflies] [worth]
 
 A plain wall of luminance 1 under noise of mean 1, preset `adaptive`. Alarms: 256x256, frames 10 to 14, with the stage and without:
 variance over the pixels of the history without / with it, mean square error and squared difference of successive frames of the
 filtered picture with / without it. Fireflies: 128x128, uniform noise of one sample, in the 11th frame so many pixels inside 16x16
 have 1000 times the wall's light: the share of the wall whose history is made more than 30 % brighter, mean of 12 tries. (How soon
-steps of the light are followed: tests/test_adaptation.py.)
+steps of the light are followed: tests/test_adaptation.py.) Worth: what `effective_history` tells beside what is seen, one frame's
+variance over that of the accumulated light about its mean, without spatial filter: in the frame before a step of the light and the
+three after it, of a whole wall and of squares in one, their outermost 3 pixels left out; 120x120, means of 4 draws.
 """
 
 import sys
@@ -22,6 +24,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import bridge
 import scenes
 from test_adaptation import NOISES
+
+from svgf_jax.types import at_level
 
 PARAMS, CONFIG = sj.preset("adaptive")
 PARAMS = jax.tree.map(np.float32, PARAMS)
@@ -74,6 +78,34 @@ def fireflies() -> None:
             print(f"| {radius} | {count} | {100 * np.mean(shares):.2f} % |", flush=True)
 
 
+def worth() -> None:
+    config, params = CONFIG._replace(levels=0, feedback_level=-1), at_level(PARAMS, 0)
+    head = " | ".join(["before", "1st", "2nd", "3rd"])
+    print(f"| noise | samples | square | step | {head} (told / seen) |\n|---|---|---|---|---|---|---|---|")
+    for name, noise in NOISES.items():
+        for samples, size in ((1, 120), (4, 120), (1, 100), (1, 48), (1, 24), (1, 12)):
+            one = noise(np.random.default_rng(1), (samples, 10**6)).mean(axis=0).var()
+            edge = (120 - size) // 2
+            for factor in (0.1, 2.0, 10.0):
+                inner = (slice(edge + 3, 117 - edge),) * 2
+                told, seen = np.zeros(4), np.zeros(4)  # as shares of one frame's variance
+                for seed in range(4):
+                    rng, light, history = np.random.default_rng(seed), np.ones((120, 120)), None
+                    for t in range(12):
+                        if t == 9:
+                            light[edge : 120 - edge, edge : 120 - edge] = factor
+                        frame = wall(light * noise(rng, (samples, 120, 120)).mean(axis=0))
+                        if history is None:
+                            history = sj.init(frame, effective_history=True)
+                        history, output = sj.step(history, frame, params=params, config=config)
+                        if t >= 8:
+                            here = np.asarray(history.illumination[0, ..., 1])[inner] / light[60, 60]
+                            told[t - 8] += (1 / np.asarray(output.effective_history[0])[inner]).mean() / 4
+                            seen[t - 8] += here.var() / one / 4
+                cells = " | ".join(f"{1 / a:.2f} / {1 / b:.2f}" for a, b in zip(told, seen, strict=True))
+                print(f"| {name} | {samples} | {size} | {factor:g} | {cells} |", flush=True)
+
+
 if __name__ == "__main__":
-    for name in sys.argv[1:] or ("alarms", "fireflies"):
-        {"alarms": alarms, "fireflies": fireflies}[name]()
+    for name in sys.argv[1:] or ("alarms", "fireflies", "worth"):
+        {"alarms": alarms, "fireflies": fireflies, "worth": worth}[name]()
