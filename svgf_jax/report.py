@@ -102,13 +102,13 @@ def run_page(run: Run, summary: Summary, *, repairs: Callable[[Mapping[str, int]
         notes.append(
             f"There is no record of frames {format_range(unknown)}: their time, repairs and history are unknown."
         )
-    if bare := [frame.number for frame in shown if "history length" not in frame.maps.get("denoised", {})]:
+    maps_of = {frame.number: frame.maps.get("denoised", {}) for frame in shown}
+    if bare := [number for number, maps in maps_of.items() if "history length" not in maps]:
         notes.append(
             f"The filter's maps of frames {format_range(bare)} are unknown: an earlier run denoised them, and only --diagnostics "
             "keeps them in the files."
         )
-    known_maps = {frame.number: frame.maps.get("denoised", {}) for frame in shown}
-    lost = [n for n, maps in known_maps.items() if "history length" in maps and "effective history" not in maps]
+    lost = [n for n, maps in maps_of.items() if "history length" in maps and "effective history" not in maps]
     if lost and summary.resumed_at and run.method == "svgf":
         notes.append(
             f"The effective history of frames {format_range(lost)} is unknown: a run keeps it only if it begins with --report or "
