@@ -37,13 +37,13 @@ def wall(light: np.ndarray) -> sj.Frame:
     return bridge.to_frame({**scenes.flat(*light.shape), "radiance": radiance}, np.float32)
 
 
-def filtered(lights, config: sj.Config):
+def filtered(lights, config: sj.Config, params: sj.Params = PARAMS):
     """Each frame's history and output."""
     history = None
     for light in lights:
         frame = wall(light)
-        history = sj.init(frame, config=config) if history is None else history
-        history, output = sj.step(history, frame, params=PARAMS, config=config)
+        history = sj.init(frame, config=config, effective_history=True) if history is None else history
+        history, output = sj.step(history, frame, params=params, config=config)
         yield jax.tree.map(np.asarray, (history, output))
 
 
@@ -90,18 +90,13 @@ def worth() -> None:
                 inner = (slice(edge + 3, 117 - edge),) * 2
                 told, seen = np.zeros(4), np.zeros(4)  # as shares of one frame's variance
                 for seed in range(4):
-                    rng, light, history = np.random.default_rng(seed), np.ones((120, 120)), None
-                    for t in range(12):
-                        if t == 9:
-                            light[edge : 120 - edge, edge : 120 - edge] = factor
-                        frame = wall(light * noise(rng, (samples, 120, 120)).mean(axis=0))
-                        if history is None:
-                            history = sj.init(frame, effective_history=True)
-                        history, output = sj.step(history, frame, params=params, config=config)
-                        if t >= 8:
-                            here = np.asarray(history.illumination[0, ..., 1])[inner] / light[60, 60]
-                            told[t - 8] += (1 / np.asarray(output.effective_history[0])[inner]).mean() / 4
-                            seen[t - 8] += here.var() / one / 4
+                    rng, light = np.random.default_rng(seed), np.ones((12, 120, 120))
+                    light[9:, edge : 120 - edge, edge : 120 - edge] = factor
+                    lights = (now * noise(rng, (samples, 120, 120)).mean(axis=0) for now in light)
+                    for i, (history, output) in enumerate(list(filtered(lights, config, params))[8:]):
+                        here = history.illumination[0, ..., 1][inner] / light[8 + i, 60, 60]
+                        told[i] += (1 / output.effective_history[0][inner]).mean() / 4
+                        seen[i] += here.var() / one / 4
                 cells = " | ".join(f"{1 / a:.2f} / {1 / b:.2f}" for a, b in zip(told, seen, strict=True))
                 print(f"| {name} | {samples} | {size} | {factor:g} | {cells} |", flush=True)
 
