@@ -4,9 +4,13 @@
 #include <cstring>
 #include <vector>
 
-using Lanes = float __attribute__((vector_size(64)));
-using Ints = int32_t __attribute__((vector_size(64)));
+#ifdef __AVX512F__
 constexpr int WIDTH = 16;
+#else // a vector wider than the registers would be taken apart, and through memory
+constexpr int WIDTH = 8;
+#endif
+using Lanes = float __attribute__((vector_size(4 * WIDTH)));
+using Ints = int32_t __attribute__((vector_size(4 * WIDTH)));
 
 static inline Lanes load(const float *p) { Lanes v; std::memcpy(&v, p, sizeof v); return v; }
 static inline void store(float *p, Lanes v) { std::memcpy(p, &v, sizeof v); }
