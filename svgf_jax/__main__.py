@@ -6,7 +6,7 @@ def main() -> None:
     import contextlib
     import faulthandler
 
-    from svgf_jax import prints
+    from svgf_jax import kept_programs, prints
     from svgf_jax.cli import main as cli_main
     from svgf_jax.commands import terminal
 
@@ -14,6 +14,7 @@ def main() -> None:
     with contextlib.suppress(OSError, AttributeError, ValueError):  # a closed standard error
         faulthandler.enable()  # what the EXR or the video library breaks does not end in silence
     prints.set_results_apart()
+    kept_programs.keep()
     terminal.run_to_the_end(cli_main)
 
 

@@ -50,3 +50,9 @@ def observed(*arguments, cwd=None):
     error, _, told = done.stderr.rpartition("TELL ")
     seconds, *modules = told.split()
     return done.returncode, error, float(seconds), set(modules)
+
+
+def seconds_to_import(module):
+    """Processor seconds of a Python that does nothing else."""
+    code = f"import time, {module}; print(time.process_time())"
+    return float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)

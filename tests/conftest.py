@@ -1,7 +1,11 @@
 """Strict by default: dtype and rank promotion are errors, float64 is on (tests choose their dtypes themselves)."""
 
+import atexit
 import gc
+import os
 import runpy
+import shutil
+import tempfile
 from pathlib import Path
 
 import jax
@@ -13,6 +17,8 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 compile_quickly()  # `compiling.AS_USERS` takes it back
+os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp()  # what commands keep is not the user's
+atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
 runpy.run_path(str(Path(__file__).parent / "offline" / "sitecustomize.py"))  # nor do tests ask the network
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

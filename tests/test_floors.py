@@ -7,7 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    {"atomic", "memory", "prints", "regular", "remedies", "spelling"},
+    {"atomic", "kept_programs", "memory", "prints", "regular", "remedies", "spelling"},
     {"types"},
     {"limits", "tonemapping", "toml", "npz", "sampling"},
     {"color", "parameters", "metrics", "exr_layout", "threads", "check", "moments", "motion", "processes"},

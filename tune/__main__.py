@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, NoReturn
 
 from cyclopts import App, CycloptsError, Parameter
 
-from svgf_jax import SvgfError, __version__
+from svgf_jax import SvgfError, __version__, kept_programs
 from svgf_jax.cli import app as svgf_jax
 from svgf_jax.commands import terminal
 from svgf_jax.commands.project import located, use_project
@@ -72,6 +72,7 @@ def fail(message: str) -> NoReturn:
 
 def run() -> None:
     """The process of the command."""
+    kept_programs.keep()
     terminal.run_to_the_end(main)
 
 

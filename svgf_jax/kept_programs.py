@@ -1,0 +1,74 @@
+"""What JAX compiled is kept from one command to the next, so that the next begins filtering in half the time.
+
+JAX itself keeps and finds it (its persistent compilation cache), by what is computed, with which versions, on which processor. Here
+commands tell it where, before they import it: where the user's caches are. JAX_COMPILATION_CACHE_DIR names another folder, and
+JAX_ENABLE_COMPILATION_CACHE=false keeps nothing. `import svgf_jax` alone leaves all this to the program that it is in.
+"""
+
+import os
+import stat
+import warnings
+from contextlib import suppress
+from pathlib import Path
+from typing import TextIO
+
+import platformdirs
+
+VARIABLE = "JAX_COMPILATION_CACHE_DIR"
+LIMIT = 2**28
+"""Bytes beyond which all is given up, to be compiled again: some five hundred programs."""
+
+
+def keep() -> None:
+    """For a program, at its start: keep what JAX compiles, unless the environment says where or the folder is not safe."""
+    folder = platformdirs.user_cache_path("svgf_jax", appauthor=False) / "compiled"
+    if VARIABLE in os.environ or not folder.is_absolute() or not _safe(folder):  # without a home it is relative
+        return
+    if sum(_sizes(folder)) > LIMIT:
+        empty(folder)
+    os.environ[VARIABLE] = str(folder)
+    show = warnings.showwarning
+
+    def showwarning(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if "persistent compilation cache" in str(message):  # cut off by a full disk, or may not be written
+            empty(folder)
+        else:
+            show(message, category, filename, lineno, file, line)
+
+    warnings.showwarning = showwarning
+
+
+def empty(folder: Path) -> None:
+    """Remove what is kept there, as far as may be."""
+    for entry in folder.glob("*-cache"):
+        with suppress(OSError):
+            entry.unlink()
+
+
+def _safe(folder: Path) -> bool:
+    """Whether nobody else can put programs there: what is found is run."""
+    for place in (folder, folder.parent):
+        try:
+            found = place.stat()
+        except FileNotFoundError:  # JAX makes it
+            continue
+        except OSError:
+            return False
+        if hasattr(os, "geteuid") and (found.st_uid != os.geteuid() or found.st_mode & stat.S_IWOTH):
+            return False
+    return True
+
+
+def _sizes(folder: Path) -> list[int]:
+    sizes: list[int] = []
+    for entry in folder.glob("*"):
+        with suppress(OSError):  # another command removed it
+            sizes.append(entry.stat().st_size)
+    return sizes
