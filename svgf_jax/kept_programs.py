@@ -21,6 +21,9 @@ LIMIT = 2**28
 
 def keep() -> None:
     """For a program, at its start: keep what JAX compiles, unless the environment says where or the folder is not safe."""
+    # Else XLA takes what its compiler prefers with AVX-512 for an instruction that the processor lacks, and tells a page of it each
+    # time that a program is found. What really fails is raised.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     folder = platformdirs.user_cache_path("svgf_jax", appauthor=False) / "compiled"
     if VARIABLE in os.environ or not folder.is_absolute() or not _safe(folder):  # without a home it is relative
         return

@@ -70,6 +70,16 @@ def test_a_folder_that_cannot_be_made_does_not_matter(caches, tmp_path):
     denoise(tmp_path / "out")
 
 
+def test_what_xla_says_of_found_programs_is_not_heard_unless_asked_for(caches, monkeypatch):
+    monkeypatch.setenv(kept_programs.VARIABLE, "")  # nothing else is done
+    for said, heard in ((None, "3"), ("0", "0")):
+        monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", said or "")
+        if said is None:
+            monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
+        kept_programs.keep()
+        assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == heard
+
+
 @posix
 @pytest.mark.parametrize("level", [0, 1])
 def test_a_folder_that_others_may_write_to_is_not_used(caches, monkeypatch, level):
