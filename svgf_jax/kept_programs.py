@@ -20,12 +20,12 @@ LIMIT = 2**28
 
 
 def keep() -> None:
-    """For a program, at its start: keep what JAX compiles, unless the environment says where or the folder is not safe."""
+    """For a program, at its start: keep what JAX compiles, unless the environment says where or the folder is another's."""
     # Else XLA takes what its compiler prefers with AVX-512 for an instruction that the processor lacks, and tells a page of it each
     # time that a program is found. What really fails is raised.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     folder = platformdirs.user_cache_path("svgf_jax", appauthor=False) / "compiled"
-    if VARIABLE in os.environ or not folder.is_absolute() or not _safe(folder):  # without a home it is relative
+    if VARIABLE in os.environ or not folder.is_absolute() or not _ours(folder):  # without a home it is relative
         return
     if sum(_sizes(folder)) > LIMIT:
         empty(folder)
@@ -55,16 +55,21 @@ def empty(folder: Path) -> None:
             entry.unlink()
 
 
-def _safe(folder: Path) -> bool:
-    """Whether nobody else can put programs there: what is found is run."""
-    for place in (folder, folder.parent):
+def _ours(folder: Path) -> bool:
+    """Whether it is the user's own, for what is found is run; closed, and emptied, where others could have put something there."""
+    for place in (folder.parent, folder):
         try:
             found = place.stat()
+            if not hasattr(os, "geteuid"):
+                continue
+            if found.st_uid != os.geteuid():
+                return False
+            if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):  # JAX made it under a umask that is so
+                place.chmod(stat.S_IRWXU)
+                empty(folder)
         except FileNotFoundError:  # JAX makes it
             continue
         except OSError:
-            return False
-        if hasattr(os, "geteuid") and (found.st_uid != os.geteuid() or found.st_mode & stat.S_IWOTH):
             return False
     return True
 

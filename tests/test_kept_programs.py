@@ -80,27 +80,44 @@ def test_what_xla_says_of_found_programs_is_not_heard_unless_asked_for(caches, m
         assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == heard
 
 
+@pytest.fixture
+def folder(caches, monkeypatch):
+    """Where programs are kept, there already with one in it; and what `keep` sets is put back."""
+    folder = caches / "svgf_jax" / "compiled"
+    folder.mkdir(parents=True, mode=0o700)
+    folder.parent.chmod(0o700)
+    (folder / "a-cache").write_bytes(bytes(600))
+    monkeypatch.setattr("warnings.showwarning", None)
+    monkeypatch.setenv(kept_programs.VARIABLE, "")
+    monkeypatch.delenv(kept_programs.VARIABLE)
+    return folder
+
+
 @posix
 @pytest.mark.parametrize("level", [0, 1])
-def test_a_folder_that_others_may_write_to_is_not_used(caches, monkeypatch, level):
-    folder = caches / "svgf_jax" / "compiled"
-    folder.mkdir(parents=True)
-    (folder, folder.parent)[level].chmod(0o777)
+@pytest.mark.parametrize("mode", [0o777, 0o775])
+def test_what_others_could_have_put_there_is_removed_and_the_folder_closed(folder, level, mode):
+    place = (folder, folder.parent)[level]
+    place.chmod(mode)
+    kept_programs.keep()
+    assert os.environ[kept_programs.VARIABLE] == str(folder)
+    assert not list(folder.iterdir())
+    assert place.stat().st_mode & 0o777 == 0o700
+
+
+@posix
+def test_what_is_another_users_is_neither_used_nor_touched(folder, monkeypatch):
+    folder.chmod(0o777)
+    monkeypatch.setattr(os, "geteuid", lambda: folder.stat().st_uid + 1)
     kept_programs.keep()
     assert kept_programs.VARIABLE not in os.environ
+    assert list(folder.iterdir())
+    assert folder.stat().st_mode & 0o777 == 0o777
 
 
-def test_of_too_much_nothing_is_kept(caches, monkeypatch):
-    folder = caches / "svgf_jax" / "compiled"
-    folder.mkdir(parents=True)
-    for name in ("a-cache", "b-cache"):
-        (folder / name).write_bytes(bytes(600))
-    monkeypatch.setattr("warnings.showwarning", None)  # put back afterwards
-    monkeypatch.setenv(kept_programs.VARIABLE, "")  # likewise
-    monkeypatch.delenv(kept_programs.VARIABLE)
-    for limit, left in ((1200, 2), (1199, 0)):
-        monkeypatch.setattr(kept_programs, "LIMIT", limit)
-        os.environ.pop(kept_programs.VARIABLE, None)
-        kept_programs.keep()
-        assert os.environ[kept_programs.VARIABLE] == str(folder)
-        assert len(list(folder.iterdir())) == left
+@pytest.mark.parametrize(("limit", "left"), [(600, 1), (599, 0)])
+def test_of_too_much_nothing_is_kept(folder, monkeypatch, limit, left):
+    monkeypatch.setattr(kept_programs, "LIMIT", limit)
+    kept_programs.keep()
+    assert os.environ[kept_programs.VARIABLE] == str(folder)
+    assert len(list(folder.iterdir())) == left
