@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array, lax
 
 from svgf_jax.edges import NEVER, Guides
-from svgf_jax.sampling import Planes, map_strips
+from svgf_jax.sampling import Planes, map_strips, on_cpu
 
 Color = tuple[Array, ...]  # red, green, blue
 CELL_STRIP_PIXELS = 24576  # of a strip: larger ones cost fewer turns of the loop, but leave the level-2 cache
@@ -111,7 +111,7 @@ def _split(pixels: Pixels, size: int) -> Pixels:
     """`[H, W]` -> `[count, n size, w size]`, 0 beyond the image."""
     height, width = pixels.known.shape
     down, across = -(-height // size), -(-width // size) * size
-    wanted = max(1, CELL_STRIP_PIXELS // (across * size))
+    wanted = max(1, CELL_STRIP_PIXELS // (across * size)) if on_cpu() else down
     rows = size * next(
         n for n in range(min(wanted, max(1, down // 2)), 0, -1) if down % n == 0
     )  # or else all was copied

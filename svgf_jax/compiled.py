@@ -71,17 +71,22 @@ def compile_filters(
     jitted_init, jitted_step = _jitted(init, step, config, leave_out, chosen, asked)
     compiled = False
 
+    def begun(frame: Frame) -> History:
+        with jax.default_device(chosen[0]):  # for `sampling.on_cpu`
+            return jitted_init(put(frame))
+
     def filtered(history: History, frame: Frame) -> tuple[History, Output]:
         nonlocal compiled
         arguments = (*put((history, frame)), numbers)
-        if not compiled:  # apart, so that its memory is given back before the frame needs its own
-            jitted_step.lower(*arguments).compile()
-            memory.give_back()
-            compiled = True
-        return jitted_step(*arguments)
+        with jax.default_device(chosen[0]):
+            if not compiled:  # apart, so that its memory is given back before the frame needs its own
+                jitted_step.lower(*arguments).compile()
+                memory.give_back()
+                compiled = True
+            return jitted_step(*arguments)
 
     return Filters(
-        init=lambda frame: jitted_init(put(frame)),
+        init=begun,
         step=filtered,
         device=f"{f'{devices} x ' if devices > 1 else ''}{chosen[0].platform}: {chosen[0].device_kind}",
     )

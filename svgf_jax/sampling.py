@@ -134,12 +134,22 @@ def _division(plane: Array) -> tuple[str | None, int, int]:
 def split_rows(height: int, width: int, strip_rows: int) -> tuple[int, int]:
     """How many strips, and of how many rows, for strips of about `strip_rows` rows (`BY_WIDTH`: of about STRIP_PIXELS pixels).
 
-    Never one strip: the compiler would dissolve that loop into its surroundings, and round differently in a scan over frames than
-    in a step by itself.
+    On other devices than CPUs `BY_WIDTH` is two strips, as long as they can be. Never one strip: the compiler would dissolve that
+    loop into its surroundings, and round differently in a scan over frames than in a step by itself.
     """
-    wanted = strip_rows or max(1, STRIP_PIXELS // width)
+    wanted = strip_rows or (max(1, STRIP_PIXELS // width) if on_cpu() else height)
     count = max(2, -(-height // wanted))
     return count, -(-height // count)
+
+
+def on_cpu() -> bool:
+    """Whether JAX computes on CPUs, whose caches want short strips; other devices work on all pixels of a strip at once.
+
+    It is the default device that is asked, by which JAX also tells apart what it has traced.
+    """
+    settings: Any = jax.config
+    chosen = settings.jax_default_device
+    return (jax.default_backend() if chosen is None else getattr(chosen, "platform", chosen)) == "cpu"
 
 
 def unroll_taps(height: int, width: int, taps: int) -> bool:

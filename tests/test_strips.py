@@ -4,10 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scenes
+from bridge import relative_error, to_frame, to_params
 from hypothesis import given
 from hypothesis import strategies as st
 
-from svgf_jax import sampling
+from svgf_jax import init, pipeline, preset, sampling
 
 
 @given(height=st.integers(1, 5000), width=st.integers(1, 9000), strip_rows=st.integers(0, 80))
@@ -19,6 +21,36 @@ def test_strips_cover_the_image_with_few_rows_to_spare(height, width, strip_rows
         assert rows <= strip_rows
     elif width <= sampling.STRIP_PIXELS:
         assert rows * width <= sampling.STRIP_PIXELS
+
+
+def test_strips_are_as_long_as_can_be_where_jax_does_not_compute_on_cpus(monkeypatch):
+    assert sampling.split_rows(1080, 1920, sampling.BY_WIDTH) == (180, 6)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert sampling.split_rows(1080, 1920, sampling.BY_WIDTH) == (2, 540)
+    assert sampling.split_rows(1080, 1920, 8) == (135, 8)
+    with jax.default_device(jax.devices("cpu")[0]):  # a CPU beside a GPU
+        assert sampling.split_rows(1080, 1920, sampling.BY_WIDTH) == (180, 6)
+
+
+def test_a_step_is_the_same_with_strips_of_any_length(monkeypatch):
+    params, config = preset("adaptive")
+    params = to_params(jax.tree.map(lambda leaf: np.ravel(leaf)[0], params)._asdict())
+    config = config._replace(levels=1)
+    frames = [to_frame(frame) for frame in scenes.synthetic(5, 160, 200, frames=3)]
+
+    def filtered():
+        go = jax.jit(lambda history, frame: pipeline.step.__wrapped__(history, frame, params=params, config=config))
+        history = init(frames[0], config=config)
+        for frame in frames:
+            history, output = go(history, frame)
+        return history, output
+
+    assert sampling.split_rows(160, 200, sampling.BY_WIDTH) == (3, 54)
+    short = filtered()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert sampling.split_rows(160, 200, sampling.BY_WIDTH) == (2, 80)
+    for long, brief in zip(jax.tree.leaves(filtered()), jax.tree.leaves(short), strict=True):
+        assert relative_error(np.asarray(long), np.asarray(brief)).max() < 1e-9
 
 
 @pytest.mark.parametrize(("height", "width", "unrolled"), [(136, 224, False), (270, 480, True), (1080, 1920, True)])
