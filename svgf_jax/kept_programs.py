@@ -6,11 +6,13 @@ JAX_ENABLE_COMPILATION_CACHE=false keeps nothing. `import svgf_jax` alone leaves
 """
 
 import os
+import re
+import shutil
 import stat
 import warnings
 from contextlib import suppress
 from pathlib import Path
-from typing import TextIO
+from typing import Any
 
 import platformdirs
 
@@ -20,63 +22,75 @@ LIMIT = 2**28
 
 
 def keep() -> None:
-    """For a program, at its start: keep what JAX compiles, unless the environment says where or the folder is another's."""
-    # Else XLA takes what its compiler prefers with AVX-512 for an instruction that the processor lacks, and tells a page of it each
-    # time that a program is found. What really fails is raised.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    folder = platformdirs.user_cache_path("svgf_jax", appauthor=False) / "compiled"
-    if VARIABLE in os.environ or not folder.is_absolute() or not _ours(folder):  # without a home it is relative
+    """For a program, at its start: keep what JAX compiles, unless the environment says where or the folder is not safe."""
+    place = platformdirs.user_cache_path("svgf_jax", appauthor=False)
+    if VARIABLE in os.environ or not place.is_absolute() or not _closed(place):  # without a home it is relative
         return
-    if sum(_sizes(folder)) > LIMIT:
-        empty(folder)
+    if sum(_sizes(place)) > LIMIT:
+        with suppress(OSError):  # another command does the same
+            _empty(place)
+    folder = place / f"for-{_cores()}-cores"  # by which XLA divides the work; JAX does not look at it
     os.environ[VARIABLE] = str(folder)
-    show = warnings.showwarning
+    # XLA takes what its compiler prefers on some processors for instructions that they lack, and says so at length of each program
+    # that it finds (openxla/xla#44565), and uses it.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    _mend(folder)
 
-    def showwarning(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
-        if "persistent compilation cache" in str(message):  # cut off by a full disk, or may not be written
-            empty(folder)
-        else:
-            show(message, category, filename, lineno, file, line)
+
+def _mend(folder: Path) -> None:
+    """Where JAX warns that a program cannot be read or written, remove what it leaves, and say nothing: it compiles."""
+    told = r"Error (?:reading|writing) persistent compilation cache entry"
+    show: Any = warnings.showwarning
+
+    def showwarning(message: Warning | str, *about: Any) -> None:
+        if not re.match(told, str(message)):
+            show(message, *about)
+            return
+        name = re.search(r"'([\w.-]+)'", str(message))
+        for entry in folder.glob(f"{name[1] if name else '*'}-*-cache"):
+            with suppress(OSError):
+                entry.unlink()
 
     warnings.showwarning = showwarning
+    warnings.filterwarnings("always", message=told)
 
 
-def empty(folder: Path) -> None:
-    """Remove what is kept there, as far as may be."""
-    for entry in folder.glob("*-cache"):
-        with suppress(OSError):
-            entry.unlink()
+def _closed(place: Path) -> bool:
+    """Make the folder, if need be, and close it to others: what is found there is run. False where that cannot be had.
 
-
-def _ours(folder: Path) -> bool:
-    """Whether it is the user's own, for what is found is run; closed, and emptied, where others could have put something there."""
-    for place in (folder.parent, folder):
-        try:
-            found = place.stat()
-            if not hasattr(os, "geteuid"):
-                continue
+    Where others could write to it, it is emptied too.
+    """
+    try:
+        place.mkdir(mode=stat.S_IRWXU, parents=True, exist_ok=True)
+        found = place.stat()
+        if hasattr(os, "geteuid"):
             if found.st_uid != os.geteuid():
                 return False
-            if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):  # JAX made it under a umask that is so
+            if found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
                 place.chmod(stat.S_IRWXU)
-                empty(folder)
-        except FileNotFoundError:  # JAX makes it
-            continue
-        except OSError:
-            return False
+            if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+                _empty(place)
+                return not any(place.iterdir())
+    except OSError:
+        return False
     return True
 
 
-def _sizes(folder: Path) -> list[int]:
+def _empty(place: Path) -> None:
+    for entry in place.iterdir():
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry, ignore_errors=True)
+        else:
+            entry.unlink()
+
+
+def _sizes(place: Path) -> list[int]:
     sizes: list[int] = []
-    for entry in folder.glob("*"):
+    for entry in place.rglob("*"):
         with suppress(OSError):  # another command removed it
-            sizes.append(entry.stat().st_size)
+            sizes.append(entry.lstat().st_size if entry.is_file() else 0)
     return sizes
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,6 +1,7 @@
 """What one command compiled the next one finds; what is damaged there, or not safe, does no harm."""
 
 import os
+import warnings
 from pathlib import Path
 
 import pytest
@@ -38,7 +39,7 @@ def denoise(out: Path) -> tuple[str, bytes]:
     return done.stderr, (out / "frame_0001.exr").read_bytes()
 
 
-def test_the_next_run_finds_what_was_compiled_and_a_damaged_file_is_made_anew(caches, tmp_path):
+def test_the_next_run_finds_what_was_compiled_and_a_damaged_file_is_made_anew(caches, tmp_path, monkeypatch):
     said, first = denoise(tmp_path / "out")
     whole = kept(caches)
     assert len(whole) == 1
@@ -49,6 +50,7 @@ def test_the_next_run_finds_what_was_compiled_and_a_damaged_file_is_made_anew(ca
 
     [path] = caches.rglob("jit_go*-cache")
     path.write_bytes(path.read_bytes()[:1000])
+    monkeypatch.setenv("PYTHONWARNINGS", "error")
     said, third = denoise(tmp_path / "out")
     assert MISS in said
     assert third == first
@@ -70,54 +72,106 @@ def test_a_folder_that_cannot_be_made_does_not_matter(caches, tmp_path):
     denoise(tmp_path / "out")
 
 
-def test_what_xla_says_of_found_programs_is_not_heard_unless_asked_for(caches, monkeypatch):
-    monkeypatch.setenv(kept_programs.VARIABLE, "")  # nothing else is done
-    for said, heard in ((None, "3"), ("0", "0")):
-        monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", said or "")
-        if said is None:
-            monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be told apart on this system")
+def test_programs_for_other_numbers_of_cores_are_kept_apart(place, monkeypatch):
+    for cores in ({0}, {0, 1}):
+        monkeypatch.delenv(kept_programs.VARIABLE, raising=False)
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _, cores=cores: cores)
         kept_programs.keep()
-        assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == heard
+        assert os.environ[kept_programs.VARIABLE] == str(place / f"for-{len(cores)}-cores")
 
 
 @pytest.fixture
-def folder(caches, monkeypatch):
-    """Where programs are kept, there already with one in it; and what `keep` sets is put back."""
-    folder = caches / "svgf_jax" / "compiled"
-    folder.mkdir(parents=True, mode=0o700)
-    folder.parent.chmod(0o700)
-    (folder / "a-cache").write_bytes(bytes(600))
+def place(caches, monkeypatch):
+    """Where programs are kept, with one there already; and what `keep` sets is put back."""
+    place = caches / "svgf_jax"
+    place.mkdir(parents=True, mode=0o700)
+    (place / "for-3-cores").mkdir()
+    (place / "for-3-cores" / "jit_a-1-cache").write_bytes(bytes(600))
     monkeypatch.setattr("warnings.showwarning", None)
-    monkeypatch.setenv(kept_programs.VARIABLE, "")
-    monkeypatch.delenv(kept_programs.VARIABLE)
-    return folder
+    for name in (kept_programs.VARIABLE, "TF_CPP_MIN_LOG_LEVEL"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    with warnings.catch_warnings():
+        yield place
 
 
 @posix
-@pytest.mark.parametrize("level", [0, 1])
-@pytest.mark.parametrize("mode", [0o777, 0o775])
-def test_what_others_could_have_put_there_is_removed_and_the_folder_closed(folder, level, mode):
-    place = (folder, folder.parent)[level]
+@pytest.mark.parametrize(("mode", "left"), [(0o777, 0), (0o775, 0), (0o755, 1), (0o700, 1)])
+def test_the_folder_is_closed_to_others_and_emptied_where_they_could_write(place, mode, left):
     place.chmod(mode)
     kept_programs.keep()
-    assert os.environ[kept_programs.VARIABLE] == str(folder)
-    assert not list(folder.iterdir())
+    assert os.environ[kept_programs.VARIABLE].startswith(str(place))
+    assert len(list(place.iterdir())) == left
     assert place.stat().st_mode & 0o777 == 0o700
 
 
 @posix
-def test_what_is_another_users_is_neither_used_nor_touched(folder, monkeypatch):
-    folder.chmod(0o777)
-    monkeypatch.setattr(os, "geteuid", lambda: folder.stat().st_uid + 1)
+def test_what_is_another_users_is_neither_used_nor_touched(place, monkeypatch):
+    place.chmod(0o777)
+    monkeypatch.setattr(os, "geteuid", lambda: place.stat().st_uid + 1)
     kept_programs.keep()
     assert kept_programs.VARIABLE not in os.environ
-    assert list(folder.iterdir())
-    assert folder.stat().st_mode & 0o777 == 0o777
+    assert "TF_CPP_MIN_LOG_LEVEL" not in os.environ
+    assert list(place.iterdir())
+    assert place.stat().st_mode & 0o777 == 0o777
 
 
 @pytest.mark.parametrize(("limit", "left"), [(600, 1), (599, 0)])
-def test_of_too_much_nothing_is_kept(folder, monkeypatch, limit, left):
+def test_of_too_much_nothing_is_kept(place, monkeypatch, limit, left):
     monkeypatch.setattr(kept_programs, "LIMIT", limit)
     kept_programs.keep()
-    assert os.environ[kept_programs.VARIABLE] == str(folder)
-    assert len(list(folder.iterdir())) == left
+    assert len(list(place.iterdir())) == left
+
+
+@posix
+def test_the_folder_is_closed_whatever_the_umask(caches, monkeypatch):
+    for name in (kept_programs.VARIABLE, "TF_CPP_MIN_LOG_LEVEL"):
+        monkeypatch.setenv(name, "")
+    monkeypatch.setattr("warnings.showwarning", None)
+    monkeypatch.delenv(kept_programs.VARIABLE)
+    umask = os.umask(0)
+    try:
+        with warnings.catch_warnings():
+            kept_programs.keep()
+    finally:
+        os.umask(umask)
+    assert (caches / "svgf_jax").stat().st_mode & 0o777 == 0o700
+
+
+@posix
+def test_a_link_that_others_put_there_is_removed_and_not_what_it_leads_to(place, tmp_path):
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "jit_go-1-cache").write_bytes(b"")
+    (place / "for-2-cores").symlink_to(tmp_path / "theirs")
+    place.chmod(0o777)
+    kept_programs.keep()
+    assert not list(place.iterdir())
+    assert list((tmp_path / "theirs").iterdir())
+
+
+@pytest.mark.parametrize("filtered", ["error", "ignore", "always"])
+def test_other_programs_stay_when_one_is_damaged_and_other_warnings_are_shown(place, monkeypatch, filtered):
+    shown = []
+    monkeypatch.setattr("warnings.showwarning", lambda message, *_: shown.append(str(message)))
+    warnings.simplefilter(filtered)
+    kept_programs.keep()
+    folder = Path(os.environ[kept_programs.VARIABLE])
+    folder.mkdir()
+    for name in ("jit_a-1-cache", "jit_ab-1-cache", "jit_b-1-cache"):
+        (folder / name).write_bytes(b"")
+    warnings.warn("Error writing persistent compilation cache entry for 'jit_a': no room")
+    assert sorted(path.name for path in folder.iterdir()) == ["jit_ab-1-cache", "jit_b-1-cache"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.warn("something else")
+    assert shown == ["something else"]
+
+
+def test_what_xla_says_of_found_programs_is_not_heard_unless_asked_for(place, monkeypatch):
+    kept_programs.keep()
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
+    monkeypatch.delenv(kept_programs.VARIABLE)
+    kept_programs.keep()
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "0"
