@@ -82,18 +82,24 @@ def test_programs_for_other_numbers_of_cores_are_kept_apart(place, monkeypatch):
 
 
 @pytest.fixture
-def place(caches, monkeypatch):
-    """Where programs are kept, with one there already; and what `keep` sets is put back."""
-    place = caches / "svgf_jax"
-    place.mkdir(parents=True, mode=0o700)
-    (place / "for-3-cores").mkdir()
-    (place / "for-3-cores" / "jit_a-1-cache").write_bytes(bytes(600))
+def restored(caches, monkeypatch):
+    """The folder of a user's caches; what `keep` sets in this process is put back."""
     monkeypatch.setattr("warnings.showwarning", None)
     for name in (kept_programs.VARIABLE, "TF_CPP_MIN_LOG_LEVEL"):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
     with warnings.catch_warnings():
-        yield place
+        yield caches
+
+
+@pytest.fixture
+def place(restored):
+    """Where programs are kept, with one there already."""
+    place = restored / "svgf_jax"
+    place.mkdir(parents=True, mode=0o700)
+    (place / "for-3-cores").mkdir()
+    (place / "for-3-cores" / "jit_a-1-cache").write_bytes(bytes(600))
+    return place
 
 
 @posix
@@ -125,18 +131,13 @@ def test_of_too_much_nothing_is_kept(place, monkeypatch, limit, left):
 
 
 @posix
-def test_the_folder_is_closed_whatever_the_umask(caches, monkeypatch):
-    for name in (kept_programs.VARIABLE, "TF_CPP_MIN_LOG_LEVEL"):
-        monkeypatch.setenv(name, "")
-    monkeypatch.setattr("warnings.showwarning", None)
-    monkeypatch.delenv(kept_programs.VARIABLE)
+def test_the_folder_is_closed_whatever_the_umask(restored):
     umask = os.umask(0)
     try:
-        with warnings.catch_warnings():
-            kept_programs.keep()
+        kept_programs.keep()
     finally:
         os.umask(umask)
-    assert (caches / "svgf_jax").stat().st_mode & 0o777 == 0o700
+    assert (restored / "svgf_jax").stat().st_mode & 0o777 == 0o700
 
 
 @posix
